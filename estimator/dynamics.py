@@ -96,7 +96,7 @@ class DelayedApproach:
         ----------
         target, at_s : float
         latency_s : float, optional
-            Latency of this change; that of the constructor by default.
+            Latency of this change; by default the latency of the constructor.
 
         Raises
         ------
@@ -145,7 +145,7 @@ LATENCY_AT_1_CD_M2_S = 0.270
 LATENCY_PER_LOG_UNIT_S = 0.034
 LATENCY_RANGE_S = (0.20, 0.36)
 """Latency falls by 34 ms per log unit of luminance (Myers & Stark 1993).  At 1 cd/m² it
-is that of Link & Stark's formula for a step."""
+equals Link & Stark's formula for a step."""
 
 FAST_SHARE = 0.4
 CONSTRICTING_S = (0.28, 0.28)

@@ -9,7 +9,7 @@ this module models the light outside the core.  The clinical measure is the stra
 parameter s at 7 deg, in deg²/sr: angle² times the scattered light per steradian and
 incident light.
 
-The lens yellows with age.  The model of spectral absorption is that of van de Kraats &
+The lens yellows with age.  The model of spectral absorption is from van de Kraats &
 van Norren, J. Opt. Soc. Am. A 24, 1842 (2007), adopted by CIE 203:2012: optical density
 of all media for large fields, 0 to 90 years.
 """
@@ -86,7 +86,7 @@ class Straylight:
         Pigmentation; see `cie_glare_per_sr`.
     log_s : float or None
         Straylight parameter at 7 deg, measured or typical of a cataract; by default
-        that of the age.  The difference from the latter is proportional to the inverse
+        from the age.  The difference from the latter is proportional to the inverse
         square of the angle, as in cataracts (van den Berg & Ijspeert 1995).
     """
 

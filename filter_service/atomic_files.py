@@ -28,8 +28,8 @@ def replace_atomically(
     """Write a file under another name in its folder, then rename it.
 
     The temporary file has an unpredictable name, so that no planted link is followed,
-    whose length does not depend on that of the file, and the suffix of the file.  If
-    writing fails, an earlier file remains.
+    whose length does not depend on the name of the file, and the suffix of the file.
+    If writing fails, an earlier file remains.
 
     Parameters
     ----------

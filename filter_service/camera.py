@@ -80,7 +80,7 @@ class PixelGrid:
     left_px, top_px : int
         Place of its first pixel in the picture; negative if the image is larger.
     full_width_px, full_height_px : int
-        Size of the picture; 0 is that of the image.
+        Size of the picture; 0 stands for the size of the image.
     pixel_aspect_ratio : float
         Width of a pixel relative to its height.
     """

@@ -37,7 +37,7 @@ HLG_PEAK_CD_M2, HLG_SYSTEM_GAMMA = 1000.0, 1.2
 """Display for which BT.2100 defines the appearance of HLG."""
 
 SAME_CODES = 1
-"""Largest difference of 8-bit codes for which a profile counts as sRGB: those of
+"""Largest difference of 8-bit codes for which a profile counts as sRGB: profiles of
 cameras and scanners differ from the standard by rounding and in the darkest codes."""
 
 MAX_ICC_TAGS = 100
@@ -80,10 +80,10 @@ class Encoding:
     curves : three functions
         Light of red, green and blue for code values from 0 to 1.
     matrix : (3, 3) array or None
-        Linear sRGB from that light; None if the primaries are those of sRGB.
+        Linear sRGB from that light; None for sRGB primaries.
     luminance : (3,) array or None
         Luminance of the three channels, if they are the light of a scene that HLG's
-        system gamma turns into that of a display.
+        system gamma turns into the light of a display.
     is_hdr : bool
         Whether light brighter than white has codes.
     """

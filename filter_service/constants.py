@@ -178,8 +178,8 @@ TEXTURE_NODES = 1
 TEXTURE_STORE = 2
 TEXTURE_COLOR = 3
 TEXTURE_DEPTH = 4
-"""Image and texture units: the frame's kernels, those of field nodes, the cache, and
-color and depth of a frame in textures."""
+"""Image and texture units: the frame's kernels, the kernels of field nodes, the cache,
+and color and depth of a frame in textures."""
 
 STORE_SIDE_BITS = 12
 STORE_SIDE = 1 << STORE_SIDE_BITS

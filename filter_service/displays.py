@@ -1,13 +1,14 @@
 """Wavelengths of a display's red, green and blue: one or two for each primary.
 
-The eye blurs each wavelength differently.  A primary's PSF is that of the single
-wavelength that best represents its spectrum, weighted by the color-matching functions.
-Accuracy for a white point through 5 mm on six measured displays, against 31 wavelengths
-with the color-matching functions of CIE 1931: with "common" 51 to 58 dB in linear light
-and 47.6 to 49.8 dB encoded, with a display's own wavelengths 54 to 58 and 48.3 to 49.8
-dB, with those of the paper 41 to 54 and 43 to 48 dB.  Two wavelengths per primary, one
-standard deviation of its light to both sides, reach 50.1 to 52.1 dB encoded with
-"common" and 51.2 to 53.4 with a display's own (tests/benchmarks/bench_displays.py).
+The eye blurs each wavelength differently.  A primary's PSF is computed for the
+single wavelength that best represents its spectrum, weighted by the color-matching
+functions.  Accuracy for a white point through 5 mm on six measured displays, against 31
+wavelengths with the color-matching functions of CIE 1931: with "common" 51 to 58 dB in
+linear light and 47.6 to 49.8 dB encoded, with a display's own wavelengths 54 to 58 and
+48.3 to 49.8 dB, with the paper's 41 to 54 and 43 to 48 dB.  Two wavelengths per
+primary, one standard deviation of its light to both sides, reach 50.1 to 52.1 dB
+encoded with "common" and 51.2 to 53.4 with a display's own
+(tests/benchmarks/bench_displays.py).
 """
 
 from typing import Any
@@ -25,7 +26,7 @@ DISPLAYS = {
     "paper": (612.0, 549.0, 464.0),
 }
 """Wavelengths of red, green and blue, nm: the best single choice for common displays;
-an LCD with white LEDs; an OLED; CRT phosphors; those of Csoba & Kunkli 2023."""
+an LCD with white LEDs; an OLED; CRT phosphors; Csoba & Kunkli 2023."""
 
 WIDTHS_NM = {
     "common": (13.0, 19.0, 13.0),

@@ -57,7 +57,8 @@ def read_exr_color(
 ) -> tuple[NDArray[np.float32], PixelGrid]:
     """Return linear sRGB (height, width, 3) and the place of the pixels.
 
-    Notes are added to a list; the other parameters are those of `read_color_file`.
+    Notes are added to a list; the other parameters are the same as for
+    `read_color_file`.
 
     Raises
     ------
@@ -134,7 +135,7 @@ def read_exr_depth(
 ) -> tuple[NDArray[np.float32], PixelGrid]:
     """Return the channel of depth (height, width) and the place of the pixels.
 
-    The parameters and errors are those of `read_exr_color`.
+    The parameters and errors are the same as for `read_exr_color`.
     """
 
     def choose(names: set[str]) -> tuple[str, ...]:

@@ -47,7 +47,7 @@ def read_npy(
     """Return the array of a ``.npy`` file of bool, integers or floats.
 
     The shape in the header is compared with the file's size and the limits before any
-    memory is allocated.  ``content`` is that of the file, if it has been read.
+    memory is allocated.  ``content`` is the content of the file, if it has been read.
 
     Raises
     ------
@@ -295,7 +295,7 @@ def read_stored_depth(
 ) -> ImageFile:
     """Read the numbers of a depth file, of one channel, as stored.
 
-    The parameters and errors are those of `read_depth_file`.
+    The parameters and errors are the same as for `read_depth_file`.
     """
     suffix = _known_suffix(option, path, DEPTH_SUFFIXES, content)
     notes: list[str] = []

@@ -139,7 +139,7 @@ class RgbdView:
 
     @property
     def images(self) -> tuple[NDArray[Any], ...]:
-        """Return color and depth, and those of the hidden layer if there is one."""
+        """Return color and depth, followed by the hidden layer if there is one."""
         surfaces = zip(self.surface_colors, self.surface_depths_m, strict=True)
         return tuple(image for surface in surfaces for image in surface)
 

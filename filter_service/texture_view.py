@@ -175,8 +175,8 @@ class TextureView:
         Whether the first row of the textures is the top of the image; OpenGL's own
         images start with the bottom row.
     white_ratio : float
-        Linear light of white, relative to that of an 8-bit image: differences far below
-        it may be merged.
+        Linear light of white, relative to an 8-bit image.  Differences far below white
+        may be merged.
 
     Raises
     ------
@@ -273,7 +273,7 @@ class EarlierFrame:
     Attributes
     ----------
     number : int
-        Number of the frame among those of the context, from 1 on.
+        Number of the frame within the context, starting at 1.
     is_filtered : bool
         Whether it was filtered.  It shows its input if its kernels or lists did not fit
         the buffers, which are then enlarged.

@@ -36,7 +36,7 @@ class State:
     focus_dpt : float
         Distance of focus; 0 is infinity.
     gaze_deg : (h, v), optional
-        Gaze in the image; by default that of the settings.
+        Gaze in the image; by default from the settings.
     """
 
     pupil_diameter_mm: float

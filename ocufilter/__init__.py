@@ -13,8 +13,8 @@ and `load_profile` and `prepare_eye` turn a description of an eye into its wavef
 and PSFs.  `errors` contains the exceptions.  `__init__.pyi` lists all names by subject.
 
 Importing this package takes milliseconds: each name is loaded when it is first used.
-The names are those of the packages `filter_service`, `clients` and
-`estimator`, from which they can be imported as well.
+The packages `filter_service`, `clients` and `estimator` define these names, which
+can also be imported from there.
 
     __main__  the command line, as ``python -m ocufilter``
 """

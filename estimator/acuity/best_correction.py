@@ -28,7 +28,7 @@ C20 = 1
 """Place of defocus in the second order."""
 
 N_SAMPLES = 128
-"""Samples across the circle: the ratio is within 0.0005 of that of `predict_acuity`."""
+"""Samples across the circle: the ratio is within 0.0005 of `predict_acuity`."""
 
 SCAN_DPT = np.arange(-8, 9) * 0.25
 """Spheres added to each start: the ratio has several peaks along the sphere."""

@@ -74,9 +74,9 @@ class Acuity:
     log_mar : float
         Logarithm of the smallest legible gap, minutes of arc; 0 is 20/20.
     visual_strehl_ratio : float
-        Integral of the transfer function, weighted by neural sensitivity, over that of
-        a pupil without aberrations (VSOTF, the same as VSX; Thibos et al., J. Vision
-        4(4), 2004).
+        Integral of the transfer function, weighted by neural sensitivity, over the
+        integral for a pupil without aberrations (VSOTF, the same as VSX; Thibos et al.,
+        J. Vision 4(4), 2004).
     """
 
     log_mar: float
@@ -380,7 +380,7 @@ def retina_log_mar(
     """Return the acuity with perfect optics.
 
     The Landolt C gap (critical detail) is taken as half a cycle at the Nyquist
-    frequency.  The arguments are those of `retina_nyquist_cpd`.
+    frequency.  The arguments are the same as for `retina_nyquist_cpd`.
 
     Returns
     -------
@@ -495,7 +495,7 @@ def acuity_over_field(
     wavelength_nm: float = 555.0,
     progress: Callable[[float], None] | None = None,
 ) -> FieldAcuity:
-    """Return the acuity in several directions, for example those of a `FieldTable`.
+    """Return the acuity in several directions, such as the nodes of a `FieldTable`.
 
     Parameters
     ----------

@@ -123,7 +123,7 @@ class Transfer:
         """Return the real part (m,), averaged over orientations.
 
         It excludes detail that a phase shift displaces, and counts detail of reversed
-        contrast as negative.  The argument is that of `modulation`.
+        contrast as negative.  The argument is the same as for `modulation`.
         """
         return self._mean(self.transfer_ratio.real, at_cpd)
 

@@ -3,7 +3,7 @@
 The light of the foci interferes.  Through pupils of 2 to 3 mm, interference extends the
 depth of focus of low additions, which an incoherent sum would miss.
 
-The efficiency of diffractive orders is that of scalar theory.  The zones have equal
+The efficiency of diffractive orders follows scalar theory.  The zones have equal
 areas, so the profile is periodic in r².  The amplitude of order k is the k-th Fourier
 coefficient of the transmission over a period.  A sawtooth of h waves has an efficiency
 of sinc²(h - k) in order k: 40.5 % in each of two orders for half a wave.  Shading by
@@ -99,7 +99,7 @@ class Kinoform:
         ----------
         orders : (K,) int
         color_ratio : float
-            Design wavelength over that of the light.
+            Design wavelength over the wavelength of the light.
         """
         field = np.exp(2j * np.pi * color_ratio * np.array(self.path_ratio))
         # Samples are at the centers of their intervals.
@@ -141,7 +141,7 @@ class DiffractiveRings:
     diameter_mm : float
         Diameter of the diffractive zone; light outside it goes to the distance focus.
     centre_mm : (x, y)
-        Center relative to that of the pupil.
+        Center relative to the center of the pupil.
     """
 
     spacing_dpt: float
@@ -241,7 +241,7 @@ class RefractiveZones:
     powers_dpt : tuple of float
         Power of each zone relative to the distance focus.
     centre_mm : (x, y)
-        Center relative to that of the pupil.
+        Center relative to the center of the pupil.
     """
 
     outer_mm: tuple[float, ...]
@@ -302,7 +302,7 @@ class Lenslets:
     Attributes
     ----------
     power_dpt : float
-        Power of a lenslet in addition to that of the carrier lens.
+        Power of a lenslet in addition to the carrier lens.
     diameter_mm, pitch_mm : float
         Diameter of a lenslet, and distance between the centers of neighbors.
     inner_mm, outer_mm : float
@@ -345,7 +345,7 @@ class Lenslets:
         return replace(self, centre_mm=-np.stack([x, y], axis=-1))
 
     def main_dpt(self, wavelength_nm: float) -> NDArray[np.float64]:
-        """Return the power (1,) of the only sharp focus, that of the carrier lens."""
+        """Return the power (1,) of the only sharp focus, due to the carrier lens."""
         return np.zeros(1)
 
     def main_light_ratio(

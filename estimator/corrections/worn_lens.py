@@ -1,10 +1,10 @@
 """Contact and intraocular lenses, and the wavefront that any correction subtracts.
 
-Powers and diameters of an intraocular lens are converted from its plane to that of the
-entrance pupil.  The cornea converges light, so a ray from a distant object crosses the
-lens closer to the axis than it crosses the entrance pupil.  Diameters in the pupil are
-larger than in the lens by the ratio of the ray heights, and powers are smaller by its
-square: 3 dpt at a depth of 4.6 mm act as 2.2 dpt.
+Powers and diameters of an intraocular lens are converted from its plane to the plane
+of the entrance pupil.  The cornea converges light, so a ray from a distant object
+crosses the lens closer to the axis than it crosses the entrance pupil.  Diameters in
+the pupil are larger than in the lens by the ratio of the ray heights, and powers are
+smaller by its square: 3 dpt at a depth of 4.6 mm act as 2.2 dpt.
 """
 
 from dataclasses import dataclass, replace
@@ -97,7 +97,7 @@ class WornLens(rx.Prescription):
     depth_mm: float = 0.0
 
     def at_lens_dpt(self, power_dpt: float) -> float:
-        """Convert a power from the plane of the pupil to that of the lens, dpt."""
+        """Convert a power from the plane of the pupil to the plane of the lens, dpt."""
         return power_dpt / height_ratio(self.depth_mm) ** 2
 
     def with_gaze_offset(self, offset_deg: tuple[float, float]) -> "WornLens":
@@ -129,8 +129,8 @@ def worn_polynomial(
 ) -> NDArray[np.float64]:
     """Return the monomials (28,), um/mm^degree, that a correction subtracts on axis.
 
-    They are those of its power (`correction_polynomial`) minus its own aberration, in
-    the plane of the entrance pupil.
+    They are the terms of its power (`correction_polynomial`) minus its own aberration,
+    in the plane of the entrance pupil.
 
     Parameters
     ----------
@@ -185,7 +185,7 @@ def aberration_polynomial(lens: WornLens) -> NDArray[np.float64]:
 def shifted_polynomial(
     polynomial_um: NDArray[np.float64], centre_mm: tuple[float, float]
 ) -> NDArray[np.float64]:
-    """Return the monomials (28,) of p(u - center) from those of p(u)."""
+    """Return the monomials (28,) of p(u - center) from the monomials of p(u)."""
     if not any(centre_mm):
         return polynomial_um
     index = {tuple(e): k for k, e in enumerate(EXPONENTS.astype(int).tolist())}

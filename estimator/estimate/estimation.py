@@ -458,7 +458,7 @@ def _best_fit(
 ) -> tuple[BoundedFit, str]:
     """Fit from the nearest start, and from the other kind of start if that fits poorly.
 
-    The counts are those of both.
+    The counts are the sums over both.
     """
     best, used = None, ""
     while len(vectors):

@@ -1,7 +1,7 @@
 """Residual of the estimate: a phase that the estimated eye does not reproduce.
 
 45 parameters in human ranges do not reproduce every wavefront, and the dispersion of
-the eye's media differs a little from that of measured eyes.  On the axis the eye with
+the eye's media differs slightly from measured eyes.  On the axis the eye with
 its residual is exactly the measurement.  Off the axis the residual fades: for random
 eyes, estimated from their axis alone, it is right within some 10 deg and no help
 beyond.
@@ -55,7 +55,7 @@ _BOWL = np.where((EXPONENTS == [2, 0]).all(1) | (EXPONENTS == [0, 2]).all(1), -0
 
 @dataclass(frozen=True)
 class MeasuredResidual:
-    """Phase added to that of the ray-traced eye, in the plane of its entrance pupil.
+    """Phase added to the ray-traced wavefront, in the plane of the entrance pupil.
 
     Attributes
     ----------
@@ -66,8 +66,8 @@ class MeasuredResidual:
         Radius of the measured pupil.  In a wider one the residual is stretched (see
         `stretch_ratio`): polynomials diverge beyond the measured pupil.
     wavelengths_nm, color_dpt : (n,)
-        Refraction that corrects the eye's longitudinal color, relative to the measured
-        wavelength, to that of measured eyes (`vergence`).
+        Refraction that adjusts the eye's longitudinal color, relative to the measured
+        wavelength, to measured eyes (`vergence`).
     """
 
     residue_um: NDArray[np.float64]

@@ -197,7 +197,7 @@ class TabulatedFocusing(Focusing, Generic[State]):
     def states_at(self, accommodations_dpt: ArrayLike) -> Sequence[State]:
         """Return states (P,) at accommodations within the amplitude.
 
-        Their ``focus_dpt`` is that of the eye's own pupil.
+        Their ``focus_dpt`` is the focus through the eye's own pupil.
         """
 
     @property
@@ -304,7 +304,7 @@ class FocusedEye(FocusedSurfaces):
 
 
 class ResidualPhase(Protocol):
-    """Phase added to that of the traced eye, see `estimate.measured_residual`."""
+    """Phase added to the traced eye's wavefront (`estimate.measured_residual`)."""
 
     def on_axis_um(self, pupil_diameter_mm: ArrayLike) -> NDArray[np.float64]:
         """Return monomials (n, n_terms) at 555 nm in the plane of pupils (n,)."""
@@ -367,9 +367,9 @@ class AccommodatingEye(TabulatedFocusing[FocusedEye]):
         return total_defocus_dpt(zernike_um, radius_mm)
 
     def _taken_off_dpt(self, pupil_diameter_mm: float) -> float:
-        """Return M of the correction minus that of the residual, on a round pupil.
+        """Return M of the correction minus M of the residual, on a round pupil.
 
-        That of the last pupil is cached: a frame asks for one pupil several times.
+        The last result is cached: a frame requests the same pupil several times.
         """
         last = self._last_taken_off
         if last[0] != pupil_diameter_mm:
@@ -403,7 +403,7 @@ class AccommodatingEye(TabulatedFocusing[FocusedEye]):
     def _cornea_table(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return accommodations of the table, and M at the cornea of the traced eye.
 
-        M is that of the eye alone, through its own pupil, as the networks use it.  The
+        M refers to the eye alone, through its own pupil, as the networks use it.  The
         table ends where light no longer passes or M no longer falls: at the cornea a
         pupil is wider than in its own plane, and a strongly curved lens passes less of
         it.
@@ -467,7 +467,7 @@ class AccommodatingEye(TabulatedFocusing[FocusedEye]):
     def states_at(self, accommodations_dpt: ArrayLike) -> list[FocusedEye]:
         """Return states (P,) at accommodations within the amplitude, traced in a batch.
 
-        Their ``focus_dpt`` is that of the eye's own pupil.
+        Their ``focus_dpt`` is the focus through the eye's own pupil.
         """
         diameters_mm = self.lens_diameters_mm(accommodations_dpt)
         return self.with_diameters(accommodations_dpt, diameters_mm)

@@ -1,6 +1,6 @@
 """The 45 parameters of the eye: names, order, ranges and population statistics.
 
-Order and ranges are those of the paper's networks (Csoba & Kunkli 2023, Table 2); every
+Order and ranges match the paper's networks (Csoba & Kunkli 2023, Table 2); every
 array of 45 parameters in this project has this order.  Axes are the project's: x to the
 person's right, y up, z into the eye; the paper's y and z are our x and y.
 """

@@ -5,8 +5,8 @@ chromatic correction is added.
 
 A profile gives the surfaces and media in one state or in several of accommodation.
 Between the states every number changes smoothly: along a line between two states, a
-parabola through three, a cubic spline through more.  Laws that are quadratic in the
-accommodation, such as that of the Arizona eye, are therefore exact with three states.
+parabola through three, a cubic spline through more.  Formulas that are quadratic in
+the accommodation, as in the Arizona eye, are therefore exact with three states.
 """
 
 import dataclasses
@@ -266,7 +266,7 @@ class SurfaceEye(TabulatedFocusing[FocusedSurfaces]):
     def states_at(self, accommodations_dpt: ArrayLike) -> Sequence[FocusedSurfaces]:
         """Return states (P,) at accommodations within the amplitude.
 
-        Their ``focus_dpt`` is that of the eye's own pupil.
+        Their ``focus_dpt`` is the focus through the eye's own pupil.
         """
         wanted_dpt = np.atleast_1d(np.asarray(accommodations_dpt, dtype=np.float64))
         return [

@@ -184,7 +184,7 @@ def seen_refraction_of_vectors(
     Parameters
     ----------
     added_um : (P, n_terms), um/mm^degree
-        Wavefront added to that of the eye; none by default.
+        Wavefront added to the wavefront of the eye; none by default.
     """
     packed = pack_eyes(vectors, retina=retina)
     indices = eye_indices(REFERENCE_WAVELENGTH_NM)

@@ -144,7 +144,7 @@ class EyeOptics(Protocol):
         Parameters
         ----------
         total_defocus_dpt : array
-            Defocus of eye and object, which replaces that of the eye.
+            Defocus of eye and object, which replaces the defocus of the eye.
 
         Raises
         ------

@@ -291,7 +291,7 @@ def pupil_weights(
         ratio = nodes_mm / nodes_mm[-1]
 
         def rises(ratios: NDArray[Any]) -> NDArray[np.float64]:
-            """Return powers (n, 2, m) of ratios (n,), minus those of the first."""
+            """Return powers (n, 2, m) of ratios (n,), minus the powers of the first."""
             powers = np.stack([power, power + 2.0])
             return ratios[:, None, None] ** powers - ratio[0] ** powers
 
@@ -355,7 +355,7 @@ class FieldInterpolation:
     """Interpolation of the wavefronts and rims of a grid.
 
     A vignetted pupil has the wavefront of the next smaller unvignetted one, because a
-    fit to part of a pupil is not continuous with those of its neighbors.  Of three
+    fit to part of a pupil is not continuous with the fits of its neighbors.  Of three
     pupils, the largest has one that is extrapolated from the other two.
 
     Attributes

@@ -3,8 +3,8 @@
 An estimated eye reproduces the person's on-axis wavefront but not the peripheral ones.
 Its lens is homogeneous and its retina spherical, and the true lens gradient and retinal
 shape cannot be inferred from the on-axis wavefront.  The phase is the wavefront of the
-population for this on-axis wavefront (`periphery`), minus that of the eye model.  It is
-added to the traced wavefronts, and it is zero on the axis.
+population for this on-axis wavefront (`periphery`) minus the eye model's wavefront.  It
+is added to the traced wavefronts, and it is zero on the axis.
 
 For an eye outside the population's range (for example keratoconus), the phase is
 computed for an eye whose on-axis wavefront is clamped to that range.  How the actual
@@ -21,8 +21,8 @@ Davies & Mallen 2009 (Br J Ophthalmol 93:1225), 0.1 to 0.5 dpt more myopic over 
 diopters in Whatham et al. 2009 (J Vis 9(3):14) and Lundstrom et al. 2009 (J Vis
 9(6):17).  The eye model, with its homogeneous lens and fixed retina, turns 0.28 dpt
 more hyperopic at 30 deg for each diopter.  A phase removes that: through `CIRCLE_MM`,
-at the cornea, M, J0 and J45 relative to the axis are those of the relaxed eye.  Higher
-orders change as they are traced.
+at the cornea, M, J0 and J45 relative to the axis match the relaxed eye.  Higher orders
+change as traced.
 """
 
 from dataclasses import replace

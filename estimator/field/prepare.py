@@ -41,7 +41,7 @@ from estimator.profiles.parse import EyeProfile
 from estimator.wavefront.field_wavefronts import ellipse_from_rim, rim_from_ellipse
 
 FIELD_RATIO = 0.7
-"""Ratio of the field nodes of other wavelengths to those of the first, along each axis:
+"""Ratio of the field nodes of other wavelengths to the first one's, along each axis:
 7 x 6 for 10 x 8.  The RMS error at random fields (emmetropia, 5 mm) is then 0.98e-3 um
 instead of 0.95e-3; with 6 x 5, it is 1.2e-3."""
 

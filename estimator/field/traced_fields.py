@@ -385,7 +385,7 @@ def trace_field(
     ----------
     nodes_deg : (n_h,), (n_v,), optional
         Nodes of the whole range, unless it is shrunk or exceeds
-        `TRACED_FIELD_LIMIT_DEG`; by default those of `field_nodes_deg`.
+        `TRACED_FIELD_LIMIT_DEG`; by default from `field_nodes_deg`.
 
     Returns
     -------

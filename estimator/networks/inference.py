@@ -140,7 +140,7 @@ class Card:
     precision : str
         Precision of the stored weights, ``float16`` or ``float32``.
     error : ExpectedError
-        Error for eyes like those of the service's users.
+        Error for eyes like the service's users' eyes.
     error_by_rows : mapping
         Error by distribution of eyes: ``table_2``, uniform over the ranges of the
         paper's Table 2, and ``population``, the prior of the estimation.

@@ -26,7 +26,7 @@ class Form:
         return ()
 
     def added_curvature(self, curvatures: tuple[float, float]) -> float:
-        """Return the mean curvature, 1/mm, in addition to that of the radii."""
+        """Return the mean curvature, 1/mm, added to the curvature of the radii."""
         del curvatures
         return 0.0
 
@@ -78,7 +78,7 @@ class SeparateProfiles(Form):
 class Toroid(Form):
     """z = Rx - sqrt((Rx - p(y))² - x²), p the conic of radius Ry, as in Zemax.
 
-    The radii and the conic constant are those of the surface.
+    The radii and the conic constant are attributes of the surface.
     """
 
     kind: ClassVar[str] = "toroid"

@@ -95,7 +95,7 @@ class PolynomialGradient:
 class SquaredPolynomialGradient:
     """n²(r, z) = sum over i, j of m_ij r^(2i) z^j, at every wavelength.
 
-    r and z are those of `PolynomialGradient`.
+    r and z are the same as in `PolynomialGradient`.
 
     Attributes
     ----------

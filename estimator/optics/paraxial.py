@@ -54,7 +54,7 @@ class CardinalPoints:
     entrance_pupil_mm : float
         Position of the entrance pupil.
     entrance_pupil_ratio : float
-        Diameter of the entrance pupil over that of the stop.
+        Diameter of the entrance pupil over the diameter of the stop.
     refraction_dpt : float
         Refraction at the cornea; negative if myopic.
     """

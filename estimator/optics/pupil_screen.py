@@ -11,7 +11,7 @@ class PupilScreen(Protocol):
 
     @property
     def centre_mm(self) -> ArrayLike:
-        """Center relative to that of the pupil: (2,), or (P, 2) for P pupils."""
+        """Center relative to the pupil's center: (2,), or (P, 2) for P pupils."""
 
     @property
     def lattice_mm(self) -> tuple[float, float, float] | None:

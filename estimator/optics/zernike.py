@@ -6,7 +6,7 @@ from monomials x^a y^b, without approximation.
 
 The last axis of an array has all terms up to an order: 28 up to order 6, the default,
 and at most 66 up to order 10.  Terms and monomials are sorted by order, so that the
-first terms of a longer array are those of a shorter one.
+first terms of a longer array are the terms of a shorter one.
 """
 
 import math

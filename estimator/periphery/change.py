@@ -4,10 +4,10 @@ The normal distribution of measured eyes (`population`) is conditioned on the ax
 this eye and on all other measured directions; the result is the most probable change,
 or one drawn from the conditional distribution.  Off the horizontal meridian,
 eyes deviate from the model of `population`; a Gaussian process that is zero on the
-meridian represents the deviation.  It follows measurements, and draws.  Its deviations
-are those of the five eyes of Polans 2015, because the population was measured on the
-meridian alone.  Orders above the fourth, which the population does not contain, are
-those of the axis in all directions.
+meridian represents the deviation.  It follows measurements and draws.  Its deviations
+come from the five eyes of Polans 2015, because the population was measured on the
+meridian alone.  Orders above the fourth, which the population does not contain, have
+their on-axis values in all directions.
 """
 
 import math
@@ -40,8 +40,8 @@ NOISE_UM = 0.02
 repeatability of instruments, and the residual of the spline between knots."""
 
 PRESCRIPTION_TERMS = (3, 4, 5)
-"""Terms on the axis that a prescription determines; typical ones tell nothing about the
-periphery, but those of a drawn person are that person's."""
+"""Terms on the axis that a prescription determines; typical ones do not predict the
+periphery, but a drawn person's terms do."""
 
 FIRST_HIGHER = 6
 """OSA index of the first higher-order term."""
@@ -67,9 +67,9 @@ FIELD_STREAM = 1
 
 FREEDOM = 5
 """Degrees of freedom of the multivariate t-distribution of drawn deviations from the
-most probable change.  Those of people are heavy-tailed: the excess kurtosis of M is 7
-to 3 between 20 deg nasal and 10 deg temporal.  With a normal distribution, the MTF of
-drawn peripheries at 10 deg is 0.045 below that of the same people."""
+most probable change.  Measured deviations are heavy-tailed: the excess kurtosis of M is
+7 to 3 between 20 deg nasal and 10 deg temporal.  With a normal distribution, the MTF of
+drawn peripheries at 10 deg is 0.045 below the MTF of the same people."""
 
 N_FEATURES = 256
 """Number of cosines of a drawn Gaussian process."""
@@ -125,7 +125,7 @@ class OffMeridianDraw(NamedTuple):
 class PeripheralChange:
     """Change of terms 3 to 14 over the field of one eye, with its uncertainty.
 
-    Except for ``eye_side``, all values are those of a right eye.
+    Except for ``eye_side``, all values describe a right eye.
 
     Attributes
     ----------
@@ -134,7 +134,7 @@ class PeripheralChange:
     axis_um : (12,)
         Wavefront on the axis, on the circle of `population`.
     is_in_population : bool
-        Whether it is that of the eye, and not clamped to the range of the population.
+        Whether it belongs to the eye and is not clamped to the population's range.
     knots_um : (96,)
         Change at the knots.
     sphere_deviation_dpt : (8,)

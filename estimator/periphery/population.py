@@ -17,7 +17,7 @@ meridian therefore rotate with one multiple of the azimuth, and odd terms with a
 For five eyes measured over +-40 x 25 deg (Polans 2015), this is as accurate as the mean
 of the other four.  Separate vertical terms, fitted to those four, are no improvement.
 
-Measured eyes are all right eyes in the project's frame.  The data are those of Jaeken &
+Measured eyes are all right eyes in the project's frame.  The data are from Jaeken &
 Artal, IOVS 53(7), 2012, as distributed with ISETBio (MIT license): both eyes of 65
 people along the horizontal meridian, 4 mm.  Angles in the file are positive in the
 temporal retina of a right eye, whose visual field is to the left: h = -angle.
@@ -47,7 +47,7 @@ parabola about it.  The change is small near the axis, and no window extends pas
 
 LEAST_POINTS = 2
 MAX_FILE_BYTES = 10_000_000
-"""Size limit of a file and of each of its arrays; that of 130 eyes has 0.4 MB."""
+"""Size limit of a file and of each of its arrays; 130 eyes take 0.4 MB."""
 
 _DAMAGED = (
     *(ValueError, KeyError, TypeError, OSError, EOFError, OverflowError),

@@ -219,8 +219,8 @@ class TrifocalBody(DiffractiveBody, kw_only=True, tag_field="kind", tag="iol/tri
         Annotated[
             tuple[StepWaves, StepWaves],
             Meta(
-                description="heights of the sawtooth of the intermediate addition and "
-                "of that of the near one on top of it, for additions 1:2; required "
+                description="heights of the sawtooths of the intermediate addition "
+                "and, on top of it, the near addition, for additions 1:2; required "
                 "without `light_ratio`"
             ),
         ]
@@ -407,7 +407,7 @@ class CommonBody(Body, kw_only=True):
             Literal["people", "model"],
             Meta(
                 description="`people` (default): off-axis wavefronts of the measured "
-                "population; `model`: those of the surfaces. Kinds `eye`, "
+                "population; `model`: traced through the surfaces. Kinds `eye`, "
                 "`surfaces`, `pseudophakic` and `published`, and profiles with a "
                 "`retina`, always use `model`"
             ),
@@ -556,7 +556,7 @@ class EyeBody(CommonBody, kw_only=True, tag_field="kind", tag="eye"):
 
 
 MeasuredBody = PresetBody | PrescriptionBody | ZernikeBody | ZernikeSetBody | EyeBody
-"""Bodies without surfaces; those of `given_bodies` load compiled code, slowly."""
+"""Bodies without surfaces; bodies in `given_bodies` load compiled code, slowly."""
 
 MEASURED_KINDS = tuple(str(k.__struct_config__.tag) for k in get_args(MeasuredBody))
 

@@ -227,7 +227,7 @@ class CoefficientTable:
 
 
 def _check_convention(kind: str, text: str, where: str) -> None:
-    """Raise if a comment or a column names other terms or units than those of OSA."""
+    """Raise if a comment or a column names terms or units other than OSA."""
     other = OTHER_CONVENTIONS & set(re.split(r"[^a-z]+", text.lower()))
     if other:
         raise ProfileError(

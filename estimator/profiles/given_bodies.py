@@ -338,7 +338,7 @@ class PseudophakicBody(CommonBody, kw_only=True, tag_field="kind", tag="pseudoph
             Meta(
                 ge=-5.0,
                 le=5.0,
-                description="of the anterior surface; that of the mean eye by default",
+                description="of the anterior surface; by default from the mean eye",
             ),
         ]
         | UnsetType

@@ -214,7 +214,7 @@ def _built(body: msgspec.Struct, path: str) -> Any:
     Raises
     ------
     ProfileError
-        Fields contradict each other; ``path`` is that of the body.
+        Fields contradict each other; ``path`` is the path of the body.
     """
     kind = given_bodies.DATACLASSES[cast(str, body.__struct_config__.tag)]
     values: Mapping[str, Any] = {

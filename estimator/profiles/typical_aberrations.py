@@ -1,8 +1,8 @@
 """Higher-order aberrations of eyes known by a prescription alone: typical or drawn.
 
 A prescription does not determine coma, trefoil and spherical aberration, but every eye
-has them.  An eye that is traced from a prescription gets those of a typical person, or,
-if the profile has a ``sample``, those of a person drawn from the population.
+has them.  An eye that is traced from a prescription gets the aberrations of a typical
+person, or of a person drawn from the population if the profile has a ``sample``.
 
 The mean *eye* would have hardly any coma or trefoil: their signs differ from one person
 to the next and cancel in the mean.  A typical eye therefore has the root mean square of
@@ -10,7 +10,7 @@ each term, which makes its coma 1.2 times the mean coma of people (0.23 and 0.19
 Terms of azimuthal order 0 have their mean: with their root mean square, refraction
 would change with the pupil more than it does in people.
 
-Means and deviations by term are those of 200 eyes (Thibos et al. 2002, JOSA A 19:2329;
+Means and deviations by term come from 200 eyes (Thibos et al. 2002, JOSA A 19:2329;
 Thibos, Bradley & Hong 2002, OPO 22:427), growth with age is from Berrio et al. 2010 (J
 Vis 10(14):34).  `POOL_RATIO` scales them to the RMS of 2,560 eyes (Salmon & van de Pol
 2006, JCRS 32:2064), 0.045, 0.100, 0.186 and 0.327 um at 3, 4, 5 and 6 mm: a typical
@@ -70,7 +70,7 @@ adults (Thibos et al. 2002).  Thibos, Bradley & Hong 2002 draw eyes from a norma
 distribution of them."""
 
 POOL_RATIO = 1.15
-"""RMS of the eyes of Salmon & van de Pol over those of Thibos et al., at 3 to 6 mm; it
+"""RMS of Salmon & van de Pol's eyes over the RMS of Thibos et al., at 3 to 6 mm; it
 applies to all terms except a typical C(4,0), whose mean is the same in both."""
 
 TYPICAL_SIGNS = {
@@ -84,7 +84,7 @@ TYPICAL_SIGNS = {
     (6, 2): -1.0,
     (6, 4): -1.0,
 }
-"""Signs of typical terms; others have that of their mean.  These means are close to 0.
+"""Signs of typical terms, whose means are close to 0; others have their mean's sign.
 The signs are chosen such that smaller pupils, in which the fifth and sixth order appear
 as lower ones, have the RMS and the MTF of people: the MTF of a typical eye from 2 to 30
 c/deg differs by -0.01, +0.01, 0.00 and -0.03 at 3, 4, 5 and 6 mm from the mean MTF of
@@ -95,9 +95,9 @@ SAME_AZIMUTH_CORRELATION = {(3, 5): -0.2, (4, 6): -0.4}
 the eyes of Thibos et al.  Without it, drawn persons have 10 % too little at 3 mm."""
 
 FREEDOM = 7
-"""Degrees of freedom of the multivariate t-distribution of drawn persons.  The RMS of
-people has a deviation of 43 to 48 % of its mean (Thibos et al.), that of drawn ones
-41 to 47 %; in a normal distribution it would be 30 %."""
+"""Degrees of freedom of the multivariate t-distribution of drawn persons.  The RMS has
+a standard deviation of 43 to 48 % of its mean in people (Thibos et al.) and 41 to 47 %
+in drawn persons; in a normal distribution it would be 30 %."""
 
 GROWTH_UM_PER_YEAR = {(3, 1): 0.0017, (4, 0): 0.0011}
 """Growth through `GROWTH_PUPIL_MM`, between 20 and 77 years (Berrio et al. 2010).
@@ -219,7 +219,7 @@ def with_typical_aberrations(profile: EyeProfile) -> EyeProfile:
     """Return the profile with typical or drawn aberrations added if it requests them.
 
     The result requests none.  Its second order is chosen so that its least-squares
-    refraction through `PRESCRIBED_PUPIL_MM` is that of the profile, which is exactly
+    refraction through `PRESCRIBED_PUPIL_MM` equals the profile, which is exactly
     second order.
     """
     if profile.higher_order != "typical":

@@ -40,7 +40,7 @@ def convert(data: object, kind: Any) -> Any:
     Parameters
     ----------
     data : object
-        Mappings, sequences, text, booleans and numbers, those of NumPy included.
+        Mappings, sequences, text, booleans and numbers, including NumPy types.
     kind : type
         A `Body`, or a union of them.
 

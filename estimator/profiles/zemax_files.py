@@ -69,7 +69,7 @@ LARGEST = 1e100
 
 @dataclass
 class _File:
-    """Operands of a file with their values: its own, and those of each surface."""
+    """Operands of a file and of each surface, with their values."""
 
     own: dict[str, list[str]] = field(default_factory=dict)
     surfaces: list[dict[str, list[str]]] = field(default_factory=list)

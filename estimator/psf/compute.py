@@ -214,7 +214,7 @@ def plan_psfs(
 ) -> PsfPlan:
     """Check arguments, and choose the radius and method of each PSF.
 
-    The arguments are those of `compute_psf_batch`.
+    The arguments are the same as for `compute_psf_batch`.
     """
     zernike_um = checked_zernike_um(zernike_um)
     count = zernike_um.shape[0]
@@ -323,7 +323,7 @@ def compute_psf_batch(
         Relative L2 error of wave-optical PSFs: at most 3e-2 or 1e-2.  "enz" is always
         "fine".
     enz_degree : int
-        Largest Zernike degree of the ENZ series; that of the paper by default.
+        Largest Zernike degree of the ENZ series; by default the paper's.
     diffraction : bool
         Whether to include diffraction.  Without it, the PSF of a perfect eye is exactly
         one pixel.

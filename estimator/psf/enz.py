@@ -1,6 +1,6 @@
 """PSFs by the extended Nijboer-Zernike (ENZ) series, within its domain.
 
-The method is that of Csoba & Kunkli (2023), section 4.  The pupil function is expanded
+The method is from Csoba & Kunkli (2023), section 4.  The pupil function is expanded
 in Zernike functions with complex coefficients beta; the image of each Zernike function
 is V.  Defocus is part of V, and tilt shifts the image.  The series needs a Zernike
 degree of about 2 pi times the other aberrations (peak to valley, in waves), which is
@@ -58,7 +58,7 @@ Its error is 2e-6, and the table takes an eighth of the time."""
 
 
 class EnzOutsideDomain(ValueError):
-    """The aberrations require a higher Zernike degree than that of the series.
+    """The aberrations require a higher Zernike degree than the series has.
 
     Attributes
     ----------

@@ -31,7 +31,7 @@ class ScreenTables:
     offset_mm : (P, 2)
         Center of each pupil relative to the center of the screen.
     tables : (n_wavelengths, TABLE_COUNT) complex64
-        Ascending wavelengths, those of the pupils.
+        Ascending wavelengths, the same as for the pupils.
     radius_mm : float
         Radius of the last entry.
     lattice_mm : (pitch, inner, outer)

@@ -147,8 +147,8 @@ def edge_light_outside(
 ) -> NDArray[np.float64]:
     """Return the share (P,) of the light that the edges send outside discs.
 
-    The formula is that of `needed_radius_px`.  The result is infinite if the geometric
-    spot extends to the rim of the disc.
+    The formula is the same as in `needed_radius_px`.  The result is infinite if the
+    geometric spot extends to the rim of the disc.
 
     Parameters
     ----------

@@ -55,7 +55,7 @@ MAX_LENGTH = 4096
 def _fast_lengths() -> NDArray[np.int64]:
     """Return 5-smooth FFT lengths that are multiples of eight.
 
-    Their cost per sample was measured to be within 20 % of that of powers of two.
+    Their measured cost per sample is within 20 % of the cost of powers of two.
     """
     found = {
         2**a * 3**b * 5**c for a in range(3, 15) for b in range(6) for c in range(4)
@@ -104,8 +104,8 @@ def edge_response() -> NDArray[np.float32]:
 def pixel_filter(samples_per_px: int, half_width: int) -> NDArray[np.float32]:
     """Return weights that integrate a band-limited intensity over one pixel.
 
-    Weight l is that of the sample at l - reach from the center of the pixel, with reach
-    = ceil(k/2) + half_width and k samples per pixel.  The weights are those of sinc
+    Weight l belongs to the sample at l - reach from the center of the pixel, with reach
+    = ceil(k/2) + half_width and k samples per pixel.  The weights follow from sinc
     interpolation, (Si(pi b) - Si(pi a)) / pi for distances a and b to the edges of the
     pixel, tapered outside the pixel.  Their sum is k.
     """
@@ -230,7 +230,7 @@ _RADII = {6: (1.0, 0.78, 0.43, 0.0)}
 def polynomial_nodes(n_terms: int) -> NDArray[np.float64]:
     """Return nodes (n_terms, 2) that determine a polynomial.
 
-    Those of order 6 are on rings of 13, 9, 5 and 1.  The radii for other orders are
+    The nodes of order 6 are on rings of 13, 9, 5 and 1.  The radii for other orders are
     zeros of a Chebyshev polynomial.
     """
     order = radial_order(n_terms)

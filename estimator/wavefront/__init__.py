@@ -8,7 +8,7 @@ moved_plane       transfer of a wavefront to another plane along the chief ray
 
 Wavefronts are given in a plane normal to the chief ray, outside the eye: where the
 chief ray meets the cornea, or where it crosses the plane of the paraxial *entrance
-pupil*.  W is the optical path of the chief ray minus that of a ray, positive where
+pupil*.  W is the optical path of the chief ray minus the path of a ray, positive where
 light is ahead.  Coefficients use OSA/ANSI order and normalization, to radial order 6,
 on the *circle* about the chief ray that circumscribes the *rim* of the pupil.  Piston
 is zero.  Tilt is kept, so that it balances coma at the chief ray.

@@ -2,9 +2,10 @@
 
 Rays are traced from the retinal point of the chief ray out of the eye.  They are aimed
 at nodes of the stop with Broyden's method, which takes a few traces per ray; the
-paper's contracting grid finds the same rays.  The slope of W at a point is that of the
-ray.  Pupil coordinates are true positions on the circumscribed circle.  They are not
-stretched along the minor axis of the projected pupil, whose ellipse is returned too.
+paper's contracting grid finds the same rays.  The slope of W at a point is the slope of
+the ray.  Pupil coordinates are true positions on the circumscribed circle.  They are
+not stretched along the minor axis of the projected pupil, whose ellipse is returned
+too.
 """
 
 import math
@@ -36,7 +37,7 @@ TRACED_FIELD_LIMIT_DEG = 75.0
 
 
 def pupil_magnification(eye: EyeSurfaces) -> float:
-    """Return the diameter of the entrance pupil over that of the stop, at 555 nm.
+    """Return the diameter of the entrance pupil over the stop's, at 555 nm.
 
     The ratio is parabasal, about the axial chief ray: the geometric mean of both
     principal meridians.  It is nan if no axial ray passes the center of the stop.
@@ -235,7 +236,7 @@ def wavefront_aberrations(
     eye : EyeSurfaces
     wavelength_nm : float
     stop_diameter_mm, pupil_diameter_mm : float
-        Either the diameter of the iris, or that of the entrance pupil at 555 nm.
+        Diameter of either the iris, or the entrance pupil at 555 nm.
     h_deg, v_deg : float
         Azimuth and elevation of the source.
     object_dpt : float
@@ -379,8 +380,8 @@ def on_axis_zernike(
     h_deg, v_deg : float
         Field, the same for all eyes.
     pupil_z_mm : scalar or (n_eyes,)
-        z of the point of the chief ray in the plane of the circle, for example that of
-        the entrance pupil; nan for the cornea.
+        z of the point of the chief ray in the plane of the circle, for example in the
+        plane of the entrance pupil; nan for the cornea.
     n_terms : int
         Number of terms of the fit.
     n_threads : int, optional

@@ -218,7 +218,7 @@ def stop_rows(
     nodes : tuple
         See `nodes.stop_nodes`.
     at_pupil : bool
-        The plane of the wavefront is that of the entrance pupil where its z is not nan,
+        The wavefront is in the plane of the entrance pupil where its z is not nan,
         and otherwise at the cornea.
     by_slopes : bool
         Fit the slopes of W instead of W.

@@ -40,7 +40,7 @@ The preset `keratoconus` keeps 28 terms; 1.5 times its coefficients need more.""
 def _rays(n_terms: int) -> NDArray[np.float64]:
     """Return x, y and weight (n, 3) of nodes over the unit circle.
 
-    96 nodes determine sixth-order fits, 260 those of tenth order.
+    96 nodes determine sixth-order fits, and 260 nodes tenth-order fits.
     """
     rings, weights, azimuths, _ = circle_nodes(*circle_sampling(n_terms))
     points = (azimuths[:, None, :] * rings[:, None]).reshape(-1, 2)
@@ -68,8 +68,7 @@ def moved_polynomial(
     radius_mm : (...)
         Radius of the circle about the chief ray, in the plane of the given wavefronts.
     n_terms : int, optional
-        Number of terms of the result, at least that of the given ones, which is the
-        default.
+        Number of terms of the result, at least the number given, which is the default.
     """
     shape, count = polynomial_um.shape[:-1], polynomial_um[..., 0].size
     given = polynomial_um.shape[-1]
@@ -103,8 +102,8 @@ def moved_wavefront(
 ) -> NDArray[np.float64]:
     """Return a wavefront in a deeper plane, with as many terms as it needs there.
 
-    These are those of the given wavefront unless the terms up to `HIGHEST_ORDER` that
-    a fit with as many omits exceed `FIT_ERROR_UM`.
+    The number of terms does not change unless the terms up to `HIGHEST_ORDER` that such
+    a fit omits exceed `FIT_ERROR_UM`.
 
     Parameters
     ----------

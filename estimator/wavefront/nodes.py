@@ -1,7 +1,7 @@
 """Quadrature nodes over the pupil: rings and azimuths.
 
 If six orders do not describe a wavefront exactly, its coefficients depend on the
-weighting of the pupil in the fit.  The weighting is that of the reference data
+weighting of the pupil in the fit.  The weighting follows the reference data
 (eye_reference.json): 14 rings of equal area, each sampled at its outer edge.  The Gauss
 rule of this discrete measure needs fewer rings, with an error that falls exponentially
 with their number.
@@ -85,7 +85,7 @@ def stop_nodes(n_rings: int = N_RINGS, n_azimuths: int = N_AZIMUTHS) -> Nodes:
     Returns
     -------
     rings : (n_rings,)
-        Radii relative to that of the stop; the last one is the rim.
+        Radii relative to the radius of the stop; the last one is the rim.
     weights : (n_rings,)
     azimuths : (n_azimuths, 2)
         Cosine and sine.

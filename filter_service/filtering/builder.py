@@ -241,7 +241,7 @@ class Builder:
     ) -> AcceptedProfile:
         """Accept a profile; cancel an older one that is not ready.
 
-        The parameters are those of `StreamEyes.add_profile`.
+        The parameters are the same as for `StreamEyes.add_profile`.
         """
         with self.turn():
             # Also one whose build has not started: its sender expects an outcome.

@@ -220,10 +220,10 @@ class EyeFilter:
         ----------
         profile : EyeProfile, mapping, str or Path
         settings : FilterSettings or mapping, optional
-            Settings of the eye; by default those of the filter.
+            Settings of the eye; by default the settings of the filter.
         views : camera or view, or several, optional
-            Cameras to prepare for; by default those of the last frame, otherwise those
-            of the eye in use.
+            Cameras to prepare for; by default the cameras of the last frame, otherwise
+            the cameras of the eye in use.
         profile_id : int, optional
             Identifier that results return; by default the generation.
 
@@ -335,7 +335,7 @@ class EyeFilter:
         focus_dpt : float, 0 to 20
             Distance of intended focus; 0 is infinity.
         gaze_deg : (h, v), optional
-            Gaze in the image; by default that of the settings.
+            Gaze in the image; by default from the settings.
         output : "srgb8", "linear" or "linear16"
             8-bit sRGB, or linear light in float32 or float16.
         whole : bool
@@ -457,7 +457,7 @@ class EyeFilter:
         the other eye, or to begin the next frame, whose images are copied while the GPU
         filters this one.  Other engines filter the frame at once.
 
-        The parameters and errors are those of `try_filter`, which waits.
+        The parameters and errors are the same as for `try_filter`, which waits.
 
         Returns
         -------
@@ -494,7 +494,7 @@ class EyeFilter:
 
         This submits the frame to the GPU and does not wait for it, except for the first
         frame of an eye.  Later commands of the context see the filtered image.  Counts,
-        and samples of the input, are those of an earlier frame.  The caller's OpenGL
+        and samples of the input, belong to an earlier frame.  The caller's OpenGL
         state is kept.  While the eye is prepared, this writes nothing and returns
         `Preparing`, which is false.
 
@@ -506,7 +506,7 @@ class EyeFilter:
         view : TextureView
         target : GlTexture
             Texture of the size of the view: "rgba8" or "srgb8_a8" receives sRGB values,
-            "rgba16f" linear light.  Alpha is that of the input.
+            "rgba16f" linear light.  Alpha is copied from the input.
         pupil_diameter_mm, focus_dpt, gaze_deg, options
             As for `filter`.
         target_is_top_first : bool, optional
@@ -553,10 +553,10 @@ class EyeFilter:
     ) -> PlannedFrame | Preparing:
         """Return a frame that is ready to be rendered, or `Preparing`.
 
-        All states have the same pupil and focus.  The errors are those of `try_filter`.
-        To prepare two eyes at the same time, plan the frames of both before you render
-        one.  Render a plan before the next call of this filter, which may free the
-        plan's stores.
+        All states have the same pupil and focus.  The errors are the same as for
+        `try_filter`.  To prepare two eyes at the same time, plan the frames of both
+        before you render one.  Render a plan before the next call of this filter, which
+        may free the plan's stores.
         """
         arrays = [view for view in views if isinstance(view, RgbdView)]
         if arrays:

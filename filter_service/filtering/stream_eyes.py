@@ -406,8 +406,8 @@ class StreamEyes:
         profile : EyeProfile
         settings : FilterSettings
         cameras : sequence of Camera
-            Cameras to prepare for; by default those of the last frame, otherwise those
-            of the eye in use.
+            Cameras to prepare for; by default the cameras of the last frame, otherwise
+            the cameras of the eye in use.
         profile_id : int, optional
             Identifier that results return; by default the generation.
         """

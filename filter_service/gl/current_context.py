@@ -258,7 +258,7 @@ def current_moderngl_context(loader: CurrentContext) -> moderngl.Context:
         ) from error
     finally:
         if store is not None:
-            store.default_context = default  # that of the caller, who may use moderngl
+            store.default_context = default  # of the caller, who may use moderngl
 
 
 GL_CURRENT_PROGRAM, GL_ACTIVE_TEXTURE, GL_TEXTURE0 = 0x8B8D, 0x84E0, 0x84C0

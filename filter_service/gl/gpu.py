@@ -58,7 +58,7 @@ class Gpu:
     Parameters
     ----------
     device : str, optional
-        "auto", or the index of an EGL device; by default that of the environment.
+        "auto", or the index of an EGL device; by default from the environment.
     current : CurrentContext, optional
         Context of the caller to use instead of an own one.  It must be current
         whenever this object is used.

@@ -9,7 +9,7 @@ The layers of frames depend on this blur, so it must not depend on which PSFs ha
 computed.  Landing points of rays are linear in defocus, so two values of defocus
 suffice for each group.
 
-In the paper's grid, angles and distances are those of the released code.  Its foci
+In the paper's grid, angles and distances come from the released code.  Its foci
 become nodes of accommodation.  Its object distances become nodes of the total defocus
 of green light, and the other channels are shifted by their chromatic differences.
 
@@ -476,7 +476,7 @@ def paper_axes(eye: EyeOptics, spec: GridSpec) -> PlanAxes:
     """Return the nodes of field, pupil and accommodation.
 
     Pupils and foci are clamped to the ranges of the settings.  Foci with the same
-    accommodation, such as those of a myopic eye beyond its far point, are one node.
+    accommodation, such as foci of a myopic eye beyond its far point, are one node.
     """
     settings, mode = spec.settings, spec.settings.mode
     reach_deg = PAPER_REACH_DEG.get(mode, (0.0, 0.0))

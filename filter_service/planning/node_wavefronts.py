@@ -266,7 +266,7 @@ def state_frames(
     Parameters
     ----------
     pixel_from_mrad : (P, 2, 2), optional
-        Pixel scale; by default that of the stored kernels of these states.
+        Pixel scale; by default the scale of the stored kernels of these states.
     """
     if pixel_from_mrad is None:
         pixel_from_mrad = spec.node_pixel_from_mrad(states.h_deg, states.v_deg)

@@ -286,7 +286,7 @@ def bracket_axis(
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
     """Return the neighbors of values (...) in sorted nodes.
 
-    The results are those of `RaggedNodes.bracket`.
+    The results are the same as from `RaggedNodes.bracket`.
     """
     nodes = np.asarray(nodes, np.float64)
     last = nodes.size - 1
@@ -334,7 +334,7 @@ frame's layers from a plane."""
 
 
 def usable_pupils_mm(eye: EyeOptics, spec: GridSpec) -> tuple[float, float]:
-    """Return the smallest and largest pupil of a spec, limited to those of the eye."""
+    """Return the smallest and largest pupil of a spec, limited to the eye's range."""
     low_mm, high_mm = spec.settings.pupil_range_mm
     return eye.usable_pupil_mm(low_mm), eye.usable_pupil_mm(high_mm)
 

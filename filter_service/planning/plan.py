@@ -216,7 +216,7 @@ def plan_cache(
     Raises
     ------
     ProfileError
-        If the eye's defocus is beyond that of any eye.
+        If the defocus is beyond the defocus of any eye.
     GridTooLarge
         If a single group needs too many PSFs.
     PlanTooLarge
@@ -244,7 +244,7 @@ def unchecked_plan(
     Parameters
     ----------
     target_db : float, optional
-        Lowest PSNR after interpolation; by default that of the spec's tolerance.
+        Lowest PSNR after interpolation; by default from the spec's tolerance.
     predict : bool
         Predict the cost of the plan.
     progress : callable, optional
@@ -285,14 +285,14 @@ def plan_axes(
     Parameters
     ----------
     target_db : float, optional
-        Lowest PSNR after interpolation; by default that of the spec's tolerance.
+        Lowest PSNR after interpolation; by default from the spec's tolerance.
     progress : callable, optional
         Callback with the completed fraction; may raise to cancel.
 
     Raises
     ------
     ProfileError
-        If the eye's defocus is beyond that of any eye.
+        If the defocus is beyond the defocus of any eye.
     """
     allowed_error = target_error(spec)
     if target_db is not None:

@@ -38,7 +38,7 @@ BLUR_EXPONENT = 0.795
 SHARP_PX = 0.384
 OWN_SHARE = 0.41
 DIFFRACTION_SHARE = 2.9
-"""Terms of the squared blur besides that of the rays: that of a pixel, px, and factors
+"""Terms of the squared blur in addition to the rays: the pixel, px, and factors
 of D² and of the squared wavelength over pupil diameter."""
 
 AXIS_FACTOR = {
@@ -48,7 +48,7 @@ AXIS_FACTOR = {
     "accommodation": 2.5,
     "defocus": 2.2,
 }
-"""Measured mean square error relative to that of the law, by interpolated axis."""
+"""Measured mean square error relative to the formula, by interpolated axis."""
 
 COHERENCE = 0.09
 """Degree to which the errors of several axes add as amplitudes, because all of them

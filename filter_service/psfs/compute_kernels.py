@@ -58,9 +58,9 @@ class PsfEngine:
 def psf_engine(pipeline: str = "exact") -> PsfEngine:
     """Return the engine of a pipeline.
 
-    That of "exact" is the compiled one.  That of "published" is the ENZ series to the
-    paper's Zernike degree, also where the aberrations require a higher one.  Its PSFs
-    take up to 0.25 s of a core, so there is one for each thread between two checks.
+    "exact" uses the compiled engine.  "published" uses the ENZ series up to the paper's
+    Zernike degree, even where the aberrations require a higher one.  Its PSFs take up
+    to 0.25 s of a core, so there is one for each thread between two checks.
     """
     if pipeline == "published":
         series = partial(compute_psf_batch, method="enz_unchecked")

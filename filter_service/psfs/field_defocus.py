@@ -146,7 +146,7 @@ class EyeDefocus:
     ) -> tuple[NDArray[np.float64], FieldDefocus]:
         """Return the total defocus (n_fields, 3) at infinity, and its field change.
 
-        The change over the field is that of green light.
+        The change over the field is computed for green light.
         """
         at_infinity_dpt = self._defocus_dpt(
             pupil_diameter_mm=pupil_diameter_mm, accommodation_dpt=accommodation_dpt

@@ -116,7 +116,7 @@ def frame_layers(
     Parameters
     ----------
     object_range_dpt : (low, high), optional
-        Object distances in the frame; by default those of the cache.
+        Object distances in the frame; by default the range of the cache.
     step_ratio : float
         Steps between layers relative to the default.
     merge_spread_px : float

@@ -26,7 +26,7 @@ MAX_PRIMARIES = 16
 CORNERS_TWICE = 1.2
 """Ratio of the light beyond the four sides of a box to the light outside the box: light
 beyond a corner counts for two sides.  With 1.2, boxes lose 0.68 to 1.08 % of the light
-where 1 % is allowed, like those of `pack_kernels`."""
+where 1 % is allowed, as in `pack_kernels`."""
 
 
 @dataclass(frozen=True)

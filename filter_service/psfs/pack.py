@@ -2,7 +2,7 @@
 
 Off axis, kernels are elongated and displaced from their center.  The box that contains
 the light of such a kernel has a third of the area of the disc about the center.  The
-engine in C packs its own kernels; this module packs those of other engines.
+engine in C packs its own kernels; this module packs kernels of other engines.
 """
 
 from __future__ import annotations
@@ -238,7 +238,7 @@ class StoreTables(NamedTuple):
         return records.StoreTables(**pointers(**self._asdict()))
 
     def grown(self, nodes: PlanNodes) -> StoreTables:
-        """Return tables extended to ``nodes``, which start with those of the tables.
+        """Return tables extended to ``nodes``, which start with the tables' own nodes.
 
         The PSFs of the new nodes are not computed.
         """
@@ -262,7 +262,7 @@ class StateReads(NamedTuple):
     Attributes
     ----------
     groups : (n_corners,)
-        Group of each neighbor at the first field node; those of the other field nodes
+        Group of each neighbor at the first field node; groups at the other field nodes
         follow.
     scales : (n_corners,)
         Factors A / A_i of total defocus t.  Neighboring pupils are blended at equal

@@ -70,9 +70,9 @@ class PsfStore:
     spec : GridSpec
     plan : PlanAxes
         Nodes of all axes but defocus.  `groups_of` plans the defocus nodes of a state
-        when it is first read.  A `CachePlan` contains those of all states.
+        when it is first read.  A `CachePlan` contains the nodes of all states.
     engine : PsfEngine, optional
-        By default that of `psf_engine`.
+        By default from `psf_engine`.
 
     Attributes
     ----------
@@ -254,7 +254,7 @@ class PsfStore:
         until_s : float, optional
             Time of `time.monotonic` at which to stop, after the current batch.
         batch_count : int, optional
-            PSFs per batch, at most those of the engine, which are the default.
+            PSFs per batch; by default, and at most, the batch size of the engine.
         between : callable, optional
             Called after each batch but the last.
         progress : callable, optional
@@ -444,7 +444,7 @@ class PsfStore:
         """All computed kernels (n_texels,), concatenated, with rows from top to bottom.
 
         Weights are in steps of the kernel's peak over `WEIGHT_MAX`.  These steps are
-        finer than those of half-precision floats.
+        finer than the steps of half-precision floats.
         """
         return self._words[: self._n_words]
 
@@ -530,7 +530,7 @@ def build_psf_store(
     eye : EyeOptics or EyeProfile
         A profile is used as a measured wavefront.
     plan : CachePlan, optional
-        Nodes; by default those of `planning.plan.plan_cache`.
+        Nodes; by default from `planning.plan.plan_cache`.
     engine : PsfEngine
     progress : callable, optional
         Called with a fraction 0..1 and a stage.

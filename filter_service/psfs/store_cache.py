@@ -138,7 +138,7 @@ def _log_once(path: Path, text: str) -> None:
     """Log a problem with a file the first time only.
 
     The log never contains the name of a file: it is a hash of an eye, which anyone can
-    compare with those of likely prescriptions.
+    compare with hashes of likely prescriptions.
     """
     if (path, text) not in _logged:
         _logged.add((path, text))

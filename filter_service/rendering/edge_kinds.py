@@ -167,7 +167,7 @@ def _bright(
 def _object_dpt(
     view: RgbdView, surface: NDArray[np.int64], at_px: NDArray[np.int64]
 ) -> NDArray[np.float64]:
-    """Return the object distance (n,) of pixels (n, 2); that of the nearest known."""
+    """Return the nearest known object distance (n,) for each of the pixels (n, 2)."""
     x_px, y_px = at_px.T
     depth_m = np.stack(
         [m[y_px, x_px].astype(np.float64) for m in view.surface_depths_m]

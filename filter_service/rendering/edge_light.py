@@ -181,7 +181,7 @@ class EdgeLight:
     ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
         """Return the sources (n,) that are seen, their kernels and light (n, 3).
 
-        The first kernels are those of kinds that the entire pupil sees.
+        The first kernels belong to kinds that the entire pupil sees.
         """
         of_source = self._kinds.of_source
         seen = seen_by_edges(view, self._pixels, of_source, self._edges.shift_px)
@@ -368,7 +368,7 @@ class EdgeLight:
     def _add_planes(
         self, color: NDArray[np.float32], planes: dict[int, NDArray[np.float32]]
     ) -> NDArray[np.float32]:
-        """Add planes to each other, from coarse to fine; return that of 2 pixels."""
+        """Add planes to each other, from coarse to fine; return the 2-pixel plane."""
         pitch_px = max(planes, default=1)
         while pitch_px > 2:
             coarse, pitch_px = planes[pitch_px], pitch_px // 2

@@ -140,7 +140,7 @@ class ViewResult(FrameCounts, WithState):
     generation : int
         Number of the profile in its stream.
     number : int
-        Number of a frame in textures among those of the context, from 1 on.
+        Number of a frame in textures within the context, starting at 1.
     earlier : EarlierFrame or None
         For textures: the newest frame through this eye that the GPU has finished; this
         frame if the request waits, and otherwise one whose counts this result lacks.
@@ -292,7 +292,7 @@ def clamped_gaze(
     Parameters
     ----------
     gaze_deg : (h, v) or None
-        Requested gaze; None stands for that of ``spec``.
+        Requested gaze; None stands for the gaze of ``spec``.
 
     Raises
     ------

@@ -84,7 +84,7 @@ class FrameKernels:
         Weight of each part.  If its map rotates or shears, the weight is multiplied by
         the area of a mapped pixel over the area of a box with its sides.
     maps : (n, 3, 2, 2)
-        Linear maps from offsets in pixels of the image to those of the part; the exact
+        Linear maps from offsets in pixels of the image to pixels of the part; the exact
         identity where the difference is negligible.
     reach_px : (n, 4)
         Left, right, up, down.

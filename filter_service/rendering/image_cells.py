@@ -1,11 +1,12 @@
 """Square cells of the image, whose pixels share kernels, and their linear maps.
 
 PSFs change slowly over the field, so all pixels of a cell use the kernels of the cell's
-center, a weighted sum of those of the three field nodes around it.  Splatting then
-needs one kernel lookup per fragment and pixel, on axis and off axis; blending inside
-the splatting loop needs four (paper section 6.3).  Two faster changes over the field
-are treated separately: a linear map converts each node's kernel from the pixels it is
-stored in to those of the cell, and each pixel has its own defocus, by its layer.
+center, a weighted sum of the kernels of the three field nodes around it.  Splatting
+then needs one kernel lookup per fragment and pixel, on axis and off axis; blending
+inside the splatting loop needs four (paper section 6.3).  Two faster changes over the
+field are treated separately: a linear map converts each node's kernel from the pixels
+it is stored in to the pixels of the cell, and each pixel has its own defocus, by its
+layer.
 """
 
 import math

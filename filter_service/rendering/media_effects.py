@@ -4,11 +4,11 @@ Spectacles resample the view before it is filtered; the media change the filtere
 
 Scattered light has no fine detail, so it is computed on a coarse grid of visual angle:
 the image is averaged over the cells of the grid, convolved with the scatter function
-(by FFT) and interpolated to pixels.  These cells are not those of `image_cells`.  Rows
-and columns of the grid are evenly spaced in the angle along the axes of the image, so
-that each axis can be computed separately; in the corner of a field of 80 x 50 deg,
-distances along v are a fifth too long.  The surroundings of the image are assumed to be
-as bright as its edge, so that a uniform image does not change.
+(by FFT) and interpolated to pixels.  These cells differ from the cells of
+`image_cells`.  Rows and columns of the grid are evenly spaced in the angle along the
+axes of the image, so that each axis can be computed separately; in the corner of a
+field of 80 x 50 deg, distances along v are a fifth too long.  The surroundings of the
+image are assumed to be as bright as its edge, so that a uniform image does not change.
 
 A thin lens of power F, at a distance L in front of the entrance pupil, scales the
 tangent of every direction by 1 / (1 - L F): by 0.92 at -6 dpt, 12 mm in front of the

@@ -343,7 +343,7 @@ class FrontEnd:
         can_interrupt: bool,
         texture_support: TextureSupport | None,
     ) -> None:
-        """Synchronize the sessions with those of a new render worker."""
+        """Synchronize the sessions with a new render worker."""
         device.texture_support = texture_support
         device.server, device.render.can_interrupt = server, can_interrupt
         self._session_manager.attach_device(device, eyes)

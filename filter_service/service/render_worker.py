@@ -9,10 +9,10 @@ Messages from the front end:
 - ``("slot", number, size)`` with a descriptor; ``("drop_slot", number)``
 - ``("texture", key, request)`` with a descriptor; ``("drop_texture", key, number)``;
   ``("drop_textures", key)``
-- ``("open", key, session_id, generations)``, where ``generations`` are those of the
+- ``("open", key, session_id, generations)``, where ``generations`` belong to the
   session's eyes; ``("close", key)``
 - ``("profile", key, request)``
-- ``("frame", number, key, frame, places, sizes)``, where ``sizes`` are those of
+- ``("frame", number, key, frame, places, sizes)``, where ``sizes`` refer to
   compressed parts
 
 Messages to the front end:

@@ -71,7 +71,7 @@ class EyeProfiles:
     queued_profile : ProfileRequest, optional
         Newest one, to be sent next.
     profile_id, generation : int
-        Those of the last accepted profile.
+        Numbers of the last accepted profile.
     next_send_s : float
         Earliest time to send the queued profile.
     """

@@ -56,8 +56,8 @@ STOPPED_LIMIT_S = 3.0
 STOP_GRACE_S = 2.0
 
 STANDBY_AFTER_S = 5.0
-"""Delay between the last start of a process and that of a standby worker, so that they
-do not compete for the processor."""
+"""Delay between the last start of a process and the start of a standby worker, so that
+they do not compete for the processor."""
 
 log = logging.getLogger("ocufilter")
 

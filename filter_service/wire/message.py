@@ -392,7 +392,7 @@ def fit_notes(
     ----------
     notes : sequence of str
     details : sequence of NoteDetail
-        Those of a received message; otherwise each note has its own.
+        Details of a received message; otherwise each note has its own.
     """
     fitting: list[str] = []
     found: list[NoteDetail] = []

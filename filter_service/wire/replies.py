@@ -87,8 +87,8 @@ class Welcome(Message):
     """The reply to hello: the service's description, limits and credit.
 
     If ``is_resumed``, the session of the key continues: ``profile_id`` is the last
-    accepted profile of the eye ``both``, and ``profile_ids`` those of all its eyes.
-    ``n_unanswered`` frames of this connection will still be answered.
+    accepted profile of the eye ``both``, and ``profile_ids`` the accepted profiles of
+    all its eyes.  ``n_unanswered`` frames of this connection will still be answered.
     """
 
     session_id: Id
@@ -200,7 +200,7 @@ class ResultView(Record):
 class Result(Message):
     """A filtered frame, with everything that determines how it looks.
 
-    Fields that a view also has are those of the first view.  ``is_complete`` is
+    Fields that a view also has refer to the first view.  ``is_complete`` is
     deprecated and always true.
     """
 

@@ -174,7 +174,7 @@ class KernelPasses:
         )
 
     def _keeps(self, handle: GlStore, state: FrameState) -> bool:
-        """Return whether the kernels in memory are those of a state.
+        """Return whether the kernels in memory belong to a state.
 
         Another renderer of this context may have overwritten them, because it uses
         buffers of the same names.
@@ -488,7 +488,7 @@ class KernelRun:
                 )
         except KernelsTooLarge:
             self.owner.reset()
-            if self.is_kept:  # without those of frames before, they may fit
+            if self.is_kept:  # without kernels of earlier frames, they may fit
                 return False
             raise
         if counts[PLAN_OVERFLOWS]:

@@ -124,7 +124,7 @@ def split_into_strips(
     """Divide a frame so that each strip's buffers fit a storage block.
 
     Strips start at multiples of a bin, so that fragment lists and merged squares are
-    those of the whole frame.
+    the same as for the whole frame.
 
     Parameters
     ----------

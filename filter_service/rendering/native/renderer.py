@@ -47,7 +47,7 @@ from filter_service.rgbd_view import RgbdView
 from filter_service.stage_times import StageTimes
 
 MAX_EYES = 4
-"""Cache size: the eyes of a stereo frame, and those of clients that stream at the same
+"""Cache size: the eyes of a stereo frame, and of other clients that stream at the same
 time."""
 
 
