@@ -45,7 +45,6 @@ from filter_service.messages import (
     EyeName,
     FilterSettings,
     Frame,
-    FrameOptions,
     Ping,
     Pong,
     ProfileRequest,
@@ -61,7 +60,12 @@ from filter_service.messages import (
     check_states,
     encode,
 )
-from filter_service.settings import DepthKind, RenderOptionValues, as_settings
+from filter_service.settings import (
+    DepthKind,
+    RenderOptions,
+    RenderOptionValues,
+    as_settings,
+)
 from filter_service.waiting import Wait
 
 __all__ = ["Event", "FilterClient", "FilteredFrame", "RgbdView", "ViewState"]
@@ -442,7 +446,7 @@ class FilterClient:
             focus_dpt=float(focus_dpt),
             gaze_deg=None if gaze_deg is None else _floats(gaze_deg),
             output=FORMATS[output],
-            options=FrameOptions(**options),
+            options=RenderOptions(**options),
             textures=tuple(textures for _, textures in shared),
             display_time_ns=display_time_ns,
         )

@@ -72,7 +72,6 @@ from filter_service.wire.replies import (
 from filter_service.wire.requests import (
     Bye,
     Frame,
-    FrameOptions,
     Hello,
     Ping,
     ProfileRequest,
@@ -116,7 +115,6 @@ __all__ = [
     "EyeName",
     "FilterSettings",
     "Frame",
-    "FrameOptions",
     "Hello",
     "ImageFormat",
     "Limits",

@@ -6,7 +6,6 @@ the same object.  CONTRIBUTING.md describes how to add one.
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from functools import cache
@@ -40,7 +39,6 @@ Grid = Literal["planned", "paper"]
 Prepare = Literal["stream", "ranges"]
 Tolerance = Literal["loose", "normal", "fine"]
 EyeModel = Literal["traced", "wavefront"]
-Accuracy = Literal["fast", "balanced", "exact"]
 Engine = Literal["auto", "gl", "native"]
 Accumulation = Literal["coverage", "paper"]
 DepthKind = Literal["planar", "radial"]
@@ -222,13 +220,6 @@ class FilterSettings(Record):
             "estimated eye, ray-traced at any pupil and focus."
         ),
     ] = "traced"
-    accuracy: Annotated[
-        Accuracy,
-        _doc(
-            "Deprecated, without effect: eyes are traced exactly; will be removed in "
-            "version 0.3."
-        ),
-    ] = "exact"
     age_years: Annotated[
         Years | None,
         _doc(
@@ -306,7 +297,6 @@ def as_settings(settings: FilterSettings | Mapping[str, Any]) -> FilterSettings:
         If the type is wrong, a name is unknown, or a value is out of range.
     """
     if isinstance(settings, FilterSettings):
-        _warn_of_deprecated(settings)
         return settings
     if not isinstance(settings, Mapping):
         raise BadMessage(
@@ -321,18 +311,7 @@ def as_settings(settings: FilterSettings | Mapping[str, Any]) -> FilterSettings:
                 field="settings",
                 allowed=", ".join(setting_types()),
             )
-    found = FilterSettings(**settings)
-    _warn_of_deprecated(found)
-    return found
-
-
-def _warn_of_deprecated(settings: FilterSettings) -> None:
-    if settings.accuracy != "exact":
-        warnings.warn(
-            "the setting accuracy has no effect; it will be removed in version 0.3",
-            DeprecationWarning,
-            stacklevel=4,  # the caller of a method that takes settings
-        )
+    return FilterSettings(**settings)
 
 
 def setting_help(name: str) -> str:

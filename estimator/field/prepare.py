@@ -7,7 +7,6 @@ accommodations, and interpolated.
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import fields, replace
 from typing import Any
@@ -263,8 +262,6 @@ EYE_MODELS = ("traced", "wavefront")
 ESTIMATION_SHARE = 0.5
 """Progress at the end of the estimation."""
 
-ACCURACIES = ("fast", "balanced", "exact")
-
 
 def prepare_eye(
     profile: EyeProfile,
@@ -275,7 +272,6 @@ def prepare_eye(
     field_range_deg: FieldRange = ON_AXIS_DEG,
     nodes_deg: FieldNodes | None = None,
     eye_model: str = "traced",
-    accuracy: str = "exact",
     progress: Callable[[float, str], None] | None = None,
 ) -> tuple[EyeOptics, tuple[str, ...]]:
     """Return the eye of a profile over its visual field, and notes on it.
@@ -300,8 +296,6 @@ def prepare_eye(
         uses the measurement in closed form, at no cost, but does not model pupils
         larger than the measured one or the effect of accommodation on other
         aberrations.
-    accuracy : {"exact", "fast", "balanced"}
-        Deprecated and without effect; it will be removed in version 0.3.
     progress : callable, optional
         Callback with the completed fraction and a stage; may raise to cancel.
 
@@ -313,19 +307,11 @@ def prepare_eye(
     Raises
     ------
     ValueError
-        The model or accuracy is unknown, or the eye cannot be traced.
+        The model is unknown, or the eye cannot be traced.
     """
     if eye_model not in EYE_MODELS:
         raise ValueError(
             f"eye_model '{eye_model}': allowed are {', '.join(EYE_MODELS)}"
-        )
-    if accuracy not in ACCURACIES:
-        raise ValueError(f"accuracy '{accuracy}': allowed are {', '.join(ACCURACIES)}")
-    if accuracy != "exact":
-        warnings.warn(
-            "the argument accuracy has no effect; it will be removed in version 0.3",
-            DeprecationWarning,
-            stacklevel=2,
         )
     if eye_model == "wavefront" and not profile.is_given:
         return MeasuredWavefront.from_profile(profile), profile.notes

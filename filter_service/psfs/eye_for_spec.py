@@ -86,12 +86,8 @@ def eye_for_spec(
         eye_model=settings.eye_model,
         progress=report,
     )
-    if isinstance(eye, MeasuredWavefront):
-        if settings.lateral_color:
-            notes = (*notes, NO_LATERAL_COLOR)
-    elif settings.accuracy != "exact":
-        text = f"accuracy {settings.accuracy!r} has no effect: the eye is traced"
-        notes = (*notes, Note("accuracy_ignored", text))
+    if isinstance(eye, MeasuredWavefront) and settings.lateral_color:
+        notes = (*notes, NO_LATERAL_COLOR)
     if depends_on_gaze(profile.correction) and any(settings.gaze_range_deg):
         notes = (*notes, ONE_GAZE)
     return eye, notes

@@ -12,6 +12,7 @@ from msgspec import Meta
 from filter_service.camera import Camera
 from filter_service.errors import BadMessage
 from filter_service.settings import (
+    DEFAULT_OPTIONS,
     DEFAULTS,
     FilterSettings,
     GazeDeg,
@@ -110,13 +111,6 @@ class ProfileRequest(Message):
         return self
 
 
-@dataclass(frozen=True, kw_only=True)
-class FrameOptions(RenderOptions):
-    """Options of a frame on the wire: rendering options, and deprecated ones."""
-
-    prepared_only: bool = False
-
-
 @dataclass(frozen=True)
 class SharedPlaces(Record):
     """Positions in shared memory of a frame's images and of its result.
@@ -140,7 +134,7 @@ class Frame(Message):
     focus_dpt: VergenceDpt
     gaze_deg: tuple[GazeDeg, GazeDeg] | None = None
     output: ImageFormat = SRGB8
-    options: FrameOptions = FrameOptions()
+    options: RenderOptions = DEFAULT_OPTIONS
     memory: SharedPlaces | None = None
     textures: Annotated[tuple[ViewTextures, ...], Meta(max_length=MAX_VIEWS)] = ()
     compression: Compression = "none"

@@ -391,9 +391,6 @@ def test_a_traced_eye_says_how_it_was_found(scene):
     notes = run_json(*traced)["notes"]
     assert "refined from a table's eye" in notes[0]
     assert not any("network" in note or "accuracy" in note for note in notes)
-    notes = run_json(*traced, "--accuracy", "fast")["notes"]
-    assert "accuracy 'fast' has no effect: the eye is traced" in notes
-    assert "fast" in refusal(*traced, "--accuracy", "high")
 
 
 def test_cones_weigh_the_pupil_where_that_is_asked_for(scene):

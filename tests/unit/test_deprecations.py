@@ -2,16 +2,9 @@
 
 import re
 import tomllib
-import warnings
 
-import numpy as np
-import pytest
-
-from estimator import parse_profile, prepare_eye
 from filter_service import (
     Camera,
-    EyeFilter,
-    FilterSettings,
 )
 from filter_service.messages import PROTOCOL_VERSION
 from tests.source_tree import PACKAGES, ROOT, python_files
@@ -57,26 +50,3 @@ def test_every_warning_names_a_version_to_come():
     ]
     assert len(versions) == n_warnings
     assert all(_version(version) > _current() for version in versions)
-
-
-def test_the_setting_accuracy():
-    for settings in ({"accuracy": "fast"}, FilterSettings(accuracy="fast")):
-        with pytest.warns(DeprecationWarning, match="version 0.3") as caught:
-            EyeFilter(None, CAMERA, settings).close()
-        assert [warning.filename for warning in caught] == [__file__]
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        EyeFilter(None, CAMERA, FilterSettings(accuracy="exact")).close()
-
-
-def test_the_argument_accuracy():
-    with pytest.warns(DeprecationWarning, match="version 0.3") as caught:
-        prepare_eye(
-            parse_profile(PROFILE),
-            pupil_diameters_mm=np.array([4.0]),
-            focus_range_dpt=(0.0, 0.0),
-            wavelengths_nm=np.array([555.0]),
-            eye_model="wavefront",
-            accuracy="fast",
-        )
-    assert [warning.filename for warning in caught] == [__file__]

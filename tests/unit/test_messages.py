@@ -268,7 +268,6 @@ def test_the_limits_stated_are_those_of_the_service():
         ({"diffraction": "no"}, "settings.diffraction"),
         ({"lateral_color": 1}, "settings.lateral_color"),
         ({"stiles_crawford": "OD"}, "settings.stiles_crawford"),
-        ({"accuracy": "high"}, "settings.accuracy"),
         ({"gaze_deg": [61, 0]}, "settings.gaze_deg[0]"),
         ({"gaze_range_deg": [5, -1]}, "settings.gaze_range_deg[1]"),
         ({"gaze_range_deg": 5}, "settings.gaze_range_deg"),

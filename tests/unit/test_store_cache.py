@@ -264,8 +264,6 @@ def test_the_key_tells_apart_what_changes_a_store():
     others = [
         key(profile=parse_profile({"kind": "prescription", "sphere_dpt": -1.25})),
         key(eye_model="wavefront"),
-        key(accuracy="fast"),
-        key(accuracy="balanced"),
         key(tolerance="fine"),
         key(pupil_range_mm=(4.0, 4.5)),
         key(spec=field),
