@@ -256,8 +256,9 @@ class Builder:
                 error = BuildCancelled(f"{newer} replaced profile {old.profile_id}")
                 self._emit(stream, EyeFailed(old, error))
             eye = stream.add_profile(profile, settings, cameras, profile_id=profile_id)
+            # Only events so far: those of the new eye follow the caller's reply.
+            self.deliver(stream)
         self.prepare()
-        self.deliver(stream)
         return eye
 
     def plan(
