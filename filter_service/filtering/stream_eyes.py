@@ -92,6 +92,8 @@ class AcceptedProfile:
     settings : FilterSettings
     requested : tuple of Camera
         Cameras for which no store is ready yet.
+    first_camera_count : int
+        Number of cameras that were requested with the profile.
     stores : list of PreparedStore
         Stores in order of last use, at most one for each camera.
     was_ready : bool
@@ -111,6 +113,7 @@ class AcceptedProfile:
     profile: EyeProfile
     settings: FilterSettings
     requested: tuple[Camera, ...] = ()
+    first_camera_count: int = 0
     stores: list[PreparedStore] = field(default_factory=list)
     was_ready: bool = False
     failures: list[tuple[Camera, FilterError]] = field(default_factory=list)
@@ -420,6 +423,7 @@ class StreamEyes:
         own_id = generation if profile_id is None else profile_id
         eye = AcceptedProfile(generation, own_id, profile, settings)
         eye.request(cameras)
+        eye.first_camera_count = len(eye.requested)
         for old in self.eyes:
             if old not in in_use:
                 self._retire(old)

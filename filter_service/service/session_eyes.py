@@ -133,8 +133,8 @@ class SessionEyes:
         return Accepted(
             request.profile_id,
             accepted.generation,
-            is_building=bool(accepted.requested),
-            n_cameras=len(accepted.requested),
+            is_building=accepted.first_camera_count > 0,
+            n_cameras=accepted.first_camera_count,
             eye=request.eye,
         )
 
