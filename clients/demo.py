@@ -1,4 +1,4 @@
-"""Demo: two scenes streamed through six eyes by a service of its own.
+"""Demo: two scenes streamed through six eyes by a separate service.
 
 `ocufilter demo` runs it.  It writes a video, a contact sheet and latency.json.
 """
@@ -203,7 +203,7 @@ def demo(
 ) -> None:
     """Stream two scenes through six eyes and write a video and a contact sheet.
 
-    Starts a service of its own and a client that connects to it.  Writes a video (a GIF
+    Starts a separate service and a client that connects to it.  Writes a video (a GIF
     without the package av), contact_sheet.png and latency.json.
 
     ocufilter demo --out out/demo --frames 24 --size 480x270

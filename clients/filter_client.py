@@ -240,9 +240,9 @@ class FilterClient:
         settings : FilterSettings or mapping, optional
             Settings, or the fields that differ from the defaults.
         views : camera or view, or several, optional
-            Cameras to prepare for; by default, those of the last frame.  Before the
-            first frame there is nothing to prepare by default, and Accepted is returned
-            with ``is_building`` false.
+            Cameras to prepare for; by default, the cameras of the last frame.  Before
+            the first frame there is nothing to prepare by default, and Accepted is
+            returned with ``is_building`` false.
         wait : bool or "first"
             With True, return when the eye is ready for all cameras; with "first", when
             it is ready for one of them; with False, when the profile is accepted.

@@ -426,7 +426,7 @@ class ServiceLink:
             self._bound_progress()
 
     def _note_progress(self, reply: Progress) -> None:
-        """Count progress as an advance, but not what a restarted service repeats."""
+        """Count progress as an advance, unless a restarted service repeats it."""
         self._progress = reply.fraction, reply.stage
         n_missing = self._n_ready_missing.get(reply.profile_id, 0)
         key = reply.profile_id, n_missing, reply.stage

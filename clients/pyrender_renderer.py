@@ -165,7 +165,7 @@ class _SingleSampleRenderer(pyrender.Renderer):
 
 
 class PyrenderRenderer:
-    """Off-screen renderer of a pyrender scene, in an OpenGL context of its own.
+    """Off-screen renderer of a pyrender scene, in its own OpenGL context.
 
     Between calls no OpenGL context is current, so that a window's context can be.  The
     scene may change between calls.  Its meshes belong to one renderer at a time.
@@ -491,7 +491,7 @@ def load_file(path: str | Path, *, m_per_unit: float = 1.0) -> LoadedFile:
     try:
         # Textures and materials of OBJ and glTF may be in other files beside it.
         content = trimesh.load_scene(path)
-    except Exception as error:  # the readers raise what they meet
+    except Exception as error:  # the readers raise exceptions of any type
         reason = " ".join(f"{type(error).__name__}: {error}".split())
         raise InvalidFile(
             path, f"cannot be read ({reason:.200})", "a file that trimesh loads"

@@ -94,7 +94,7 @@ def eye_poses(pose: Array, ipd_mm: float | None) -> list[Array]:
 
 
 class SceneRenderer:
-    """Off-screen renderer of one scene, in an OpenGL context of its own.
+    """Off-screen renderer of one scene, in its own OpenGL context.
 
     Between calls no OpenGL context is current, so that a window's context can be.
 

@@ -8,7 +8,7 @@ Importing this package loads no submodules, which keeps clients light.
     camera           pinhole camera, and which cameras share PSFs
     rgbd_view        color, depth and camera of one view
     texture_view     the same in textures of the caller
-    filter_protocol  what `EyeFilter` and `clients.FilterClient` have in common
+    filter_protocol  common protocol of `EyeFilter` and `clients.FilterClient`
     view_state       state of an eye; eye and state of a view
     stage_times      times of a frame's stages
     messages         types of the wire protocol (PROTOCOL.md)
@@ -28,7 +28,7 @@ Importing this package loads no submodules, which keeps clients light.
     bounded_images   image decoders with memory limits
     color_encoding   color profiles and codes, and conversion to sRGB
     gl_device        selection of the OpenGL device
-    command_line     what commands share: start, output, errors, numbers
+    command_line     shared parts of commands: start, output, errors, numbers
     serve            `ocufilter serve`
     version          version of the installed package
     one_blas_thread  NumPy's BLAS on one thread

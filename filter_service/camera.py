@@ -330,7 +330,7 @@ def _has_same_view(first: Camera, second: Camera) -> bool:
 def distinct_cameras(
     cameras: Sequence[Camera], *, follows_field: bool
 ) -> tuple[Camera, ...]:
-    """Return the cameras that need a store of their own, in order."""
+    """Return the cameras that need separate stores, in order."""
     distinct: list[Camera] = []
     for camera in cameras:
         if not any(

@@ -155,7 +155,7 @@ def read_exr_depth(
 
 
 def _noted_grid(image: _Exr, notes: list[str]) -> PixelGrid:
-    """Return where the pixels of a file are; note what else the file says."""
+    """Return the pixel grid of a file; add notes on its other metadata."""
     grid = image.grid
     if image.part_count > 1:
         notes.append(f"it has {image.part_count} parts; the first is read")
@@ -193,7 +193,7 @@ def write_exr(path: Path, linear_rgb: NDArray[Any], grid: PixelGrid | None) -> N
 
 @dataclass(frozen=True)
 class _Exr:
-    """Channels of the first part of a file, and what its header says about them.
+    """Channels of the first part of a file, and their metadata.
 
     Attributes
     ----------

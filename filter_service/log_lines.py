@@ -27,7 +27,7 @@ MAX_WAITING_LINES = 1000
 
 WRITE_LIMIT_S = 0.02
 """Maximum time that a caller waits until its line is written.  It usually takes 0.1 ms,
-so that a line precedes what the process does next."""
+so that a line precedes the next action of the process."""
 
 EXIT_LIMIT_S = 0.5
 """Maximum time at exit for writing the lines that wait."""

@@ -137,7 +137,7 @@ _WITH_ALPHA = ("LA", "PA", "RGBA", "La", "RGBa")
 
 @dataclass
 class _Stored:
-    """Pixels as stored, but upright, and what is needed to show them.
+    """Pixels as stored, but upright, and the metadata needed to convert them.
 
     Attributes
     ----------
@@ -158,7 +158,7 @@ def read_picture_color(
     option: str = "",
     formats: Sequence[str] = FORMATS,
 ) -> tuple[NDArray[np.uint8] | NDArray[np.float32], list[str]]:
-    """Return the colors of an image, upright, and notes on what they do not show.
+    """Return the colors of an image, upright, and notes on ignored metadata.
 
     Parameters
     ----------
@@ -427,7 +427,7 @@ def _deep_codes(
 
 
 def _release(image: Image.Image) -> None:
-    """Free the pixels of an image, but not what its file says."""
+    """Free the pixels of an image, but not its metadata."""
     image.im = Image.new(image.mode, (1, 1)).im
 
 

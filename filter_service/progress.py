@@ -96,9 +96,9 @@ class Task:
     def _left_s(self) -> float | None:
         """Estimate the remaining time; None unless old and new items agree.
 
-        The rates of all items, with what preceded the first, and of the newest half,
-        quarter and so on differ while something is prepared, and after it.  The fewer
-        items remain, the fewer of the newest count.
+        The rates of all items, including the time before the first, and of the newest
+        half, quarter and so on differ while something is prepared, and after it.  The
+        fewer items remain, the fewer of the newest count.
         """
         if not self._samples or self.done >= self.total:
             return None

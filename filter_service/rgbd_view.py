@@ -1,6 +1,6 @@
 """One view of a scene: color, depth and camera, for clients and engines.
 
-A view may have a *hidden layer*: what the camera would see without the visible surface.
+A view may have a *hidden layer*: the image without the visible surface.
 Its light is needed where the edges of that surface are blurred.
 """
 
@@ -145,7 +145,7 @@ class RgbdView:
 
 
 def _check_plain(field: str, image: object, allowed: str) -> None:
-    """Reject what is not an array, and masked arrays, whose mask would be lost."""
+    """Reject values other than arrays, and masked arrays, whose mask would be lost."""
     if isinstance(image, np.ma.MaskedArray):
         raise BadMessage(
             f"it is a masked array with {np.asarray(image.mask).sum()} masked values",

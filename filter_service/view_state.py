@@ -160,7 +160,7 @@ def check_states(states: Sequence[ViewState], of_frame: State) -> None:
     states : sequence of ViewState
         States of the views of a frame.
     of_frame : State
-        State of the frame, for views that have none of their own.
+        State of the frame, for views without a state.
 
     Raises
     ------

@@ -83,7 +83,8 @@ class Wait:
     def is_over(self) -> bool:
         """Return whether the time limit has passed, at the last call as well.
 
-        If the program itself was suspended, it first reads what has arrived meanwhile.
+        If the program itself was suspended, it first reads messages that have arrived
+        meanwhile.
         """
         was_overdue, self._is_overdue = self._is_overdue, self.remaining_s <= 0.0
         return was_overdue and self._is_overdue

@@ -8,7 +8,7 @@ options        command line
 source         a frame: its files, camera, depth format, and the state of the eye
 layouts        detection of the layout of a data set, and videos
 datasets       pairs of images, TUM RGB-D, NYU depth v2, Middlebury stereo
-work           job, and what runs its units: reads, filters and writes frames
+work           job and its units, which read, filter and write frames
 pools          worker processes on this machine, or on many machines with Ray
 manifest       atomic writes, file hashes, and the record of the finished frames
 run            runs the missing frames of a batch, or estimates time and cost

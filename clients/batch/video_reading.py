@@ -4,7 +4,7 @@ A frame is found by its time.  The reader lists the times of all packets without
 decoding them, then seeks to the key frame that precedes a frame and decodes from there.
 Frames are returned upright and in sRGB, with colors as their tags say.
 
-FFmpeg applies the matrix of videos of 8 bits.  That of deeper ones is applied here,
+FFmpeg applies the matrix of 8-bit videos.  The matrix of deeper ones is applied here,
 because FFmpeg makes 65280 of white, as are transfer characteristics and primaries.
 Videos without tags are BT.709 from 720 lines on and BT.601 below, as players assume.
 """

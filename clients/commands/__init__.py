@@ -1,4 +1,4 @@
-"""The command line: its program, and the commands that have no package of their own.
+"""The command line: its program, and the commands without a separate package.
 
 program        the `ocufilter` program and the table of its commands
 options        options that commands share: settings, profiles, sizes
@@ -8,7 +8,7 @@ eye            estimate and field: an eye and its visual field
 optics         wavefront and psf: an eye in one direction
 checkout       bench and paper, which need a checkout
 doctor         doctor: checks of this machine
-doctor_probes  probes that run in processes of their own
+doctor_probes  probes that run in separate processes
 
 `filter_service.command_line` runs every command, and prints its errors.
 """

@@ -1,4 +1,4 @@
-"""Probes that `ocufilter doctor` runs, each in a process of its own.
+"""Probes that `ocufilter doctor` runs, each in a separate process.
 
 A broken driver may crash or hang instead of raising, which then ends only the probe.
 Each probe prints one line of JSON.

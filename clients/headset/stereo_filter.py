@@ -378,7 +378,7 @@ class LocalFilter(StereoFilter):
         return known
 
     def _note(self, picture: Picture, found: Filtered) -> None:
-        """Keep what is known of the newest frame that the GPU has finished."""
+        """Store the results of the newest frame that the GPU has finished."""
         self._views[found.number] = picture.view
         if found.earlier is None:
             return
@@ -390,13 +390,13 @@ class LocalFilter(StereoFilter):
             self._known[view.eye] = RgbdPicture(view, sampled.color, sampled.depth_m)
 
     def known(self, picture: Picture) -> Picture:
-        """Return what is known of an eye's last image, or the image itself."""
+        """Return the sample of an eye's last image, or the image itself."""
         if not isinstance(picture, TexturePicture):
             return picture
         return self._known.get(picture.view.eye, picture)
 
     def restart(self) -> None:
-        """Discard what is known of earlier frames."""
+        """Discard the samples of earlier frames."""
         self._known = {}
 
     def close(self) -> None:

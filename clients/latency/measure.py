@@ -1,4 +1,4 @@
-"""One stream for each case, the error of what came back, and text, JSON and plot."""
+"""One stream for each case, the error of the results, and text, JSON and plot."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class Case:
 
 @dataclass(frozen=True)
 class Target:
-    """The service, and what is the same in all cases.
+    """The service, and the parameters that all cases share.
 
     Attributes
     ----------
@@ -126,7 +126,7 @@ class Measured:
 
 
 def measure(target: Target, case: Case) -> Measured:
-    """Measure one case in a session of its own.
+    """Measure one case in a separate session.
 
     Raises
     ------

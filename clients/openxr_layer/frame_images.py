@@ -95,7 +95,7 @@ class FrameImages:
         ]
 
     def picture(self, index: int, eye: Eye, flat_m: float) -> tuple[RgbdPicture, str]:
-        """Return the picture of a view, and what is wrong with its depth.
+        """Return the picture of a view, and the problem with its depth, if any.
 
         Parameters
         ----------
@@ -204,7 +204,7 @@ class DepthRange(NamedTuple):
     far_m: float
 
     def problem(self) -> str:
-        """Return what is wrong with the values; empty if nothing is."""
+        """Return the problem with the values; empty if they are valid."""
         low, high, near_m, far_m = self
         if not 0.0 <= low < high <= 1.0:
             return f"the range of the buffer is {low:g} to {high:g}"

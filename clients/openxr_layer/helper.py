@@ -48,12 +48,12 @@ from filter_service.shared_memory import Slot
 USUAL_AGE_MS = 150
 MAX_WAIT_MS = 600_000
 WAIT_S = 1.0
-"""Period that is told to a service's filter, which waits for a result accordingly."""
+"""Period reported to a service's filter, which waits for a result accordingly."""
 
 MS_PER_S, US_PER_MS, NS_PER_S = 1e3, 1e3, 1e9
 _COUNTS = ("filtered", "not_filtered", "submitted", "shown_filtered", "fallback")
 N_LATE = 10
-"""Successive late results after which the user is told."""
+"""Successive late results before a message to the user."""
 
 N_TIMES = 4096
 """Newest frames whose times are reported."""
@@ -206,7 +206,7 @@ class LayerHelper:
         self._path.unlink(missing_ok=True)
 
     def run_once(self, timeout_s: float) -> None:
-        """Handle what has arrived; wait up to ``timeout_s`` if nothing has."""
+        """Handle received messages; wait up to ``timeout_s`` if there are none."""
         for key, _ in self._selector.select(timeout_s):
             found = key.fileobj
             assert isinstance(found, socket.socket)

@@ -175,9 +175,9 @@ class Document:
     Attributes
     ----------
     origin : tuple of (str, str)
-        Name and value of what identifies the report: patient, reference, date, version.
+        Names and values that identify the report: patient, reference, date, version.
     running : str
-        Text in the margin of every page: what identifies the report.
+        Text in the margin of every page, which identifies the report.
     """
 
     title: str

@@ -246,12 +246,12 @@ def _rings_limits(lens: Prescription | None) -> tuple[str, ...]:
             f"Lenslets: this report applies to {_eye_at_gaze(lens.rings.gaze_deg)}. "
             "Where they lie before the pupil, acuity and contrast are not "
             "reported: no model of reading through them is known; wavefronts and field "
-            "maps are those of the spectacles without them.",
+            "maps describe the spectacles without them.",
         )
     return (
-        "Several foci: no Zernike term holds the rings of the lens. Refraction, "
-        "wavefront and field maps are those of its focus for far; point images, "
-        "contrast, acuity and charts go through all of it.",
+        "Several foci: no Zernike term represents the rings of the lens. Refraction, "
+        "wavefront and field maps refer to its distance focus; point images, "
+        "contrast, acuity and charts include the entire lens.",
     )
 
 
@@ -276,8 +276,8 @@ def people_text(facts: EyeFacts) -> tuple[str, ...]:
     )
     if people.modulation:
         return (
-            f"{text}; the bands of contrast are best corrected, that of acuity is "
-            f"accommodating through {ACUITY_PUPIL_MM:g} mm",
+            f"{text}; the bands of contrast are best corrected, and the band of acuity "
+            f"is accommodating through {ACUITY_PUPIL_MM:g} mm",
         )
     reason = "the axis is not drawn"
     if draws_axis(profile):
@@ -497,8 +497,8 @@ def _shape(study: EyeStudy, cite: Citations) -> tuple[str, ...]:
     ratios = found.determined_ratio.values()
     count = sum(ratio > WELL_DETERMINED for ratio in ratios)
     text = (
-        f"{count} of 45 parameters follow from the wavefront for the most part; the "
-        f"others are those of a mean eye of this refraction {cite('csoba', 'length')}"
+        f"{count} of 45 parameters are mostly determined by the wavefront; the "
+        f"others describe a mean eye with this refraction {cite('csoba', 'length')}"
     )
     return ("Shape of the eye", TYPICAL, text)
 

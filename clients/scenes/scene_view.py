@@ -157,7 +157,7 @@ class SceneView:
 
     Every call makes the context current.  If moderngl obtained the context through EGL,
     no context is current afterward: other drawing in the same thread must be in a
-    ``with context:`` block of its own, which must not be open around a call.
+    separate ``with context:`` block, which must not be open around a call.
     Calls leave GL_FRAMEBUFFER_SRGB disabled.
     """
 

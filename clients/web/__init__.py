@@ -21,5 +21,5 @@ the page's event loop; its thread passes pictures to the `PictureSender`. `EyeFi
 runs in this process: a service would add the transfer in both directions (for 1280 x
 720 px, wire and queue: 1.1 ms through shared memory, 4.5 ms over ipc,
 tests/benchmarks/results/roundtrip_*_mono.json) and gain nothing, as PSFs are built in
-a process of their own either way.
+a separate process either way.
 """

@@ -96,7 +96,7 @@ class FigureWorker:
     def _start(self) -> None:
         context = multiprocessing.get_context("spawn")
         self._connection, theirs = context.Pipe()
-        # not a daemon: a report starts a worker of its own
+        # not a daemon: a report starts its own worker
         self._process = context.Process(target=_serve_requests, args=(theirs,))
         self._process.start()
         theirs.close()

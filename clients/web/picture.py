@@ -90,7 +90,7 @@ class Picture:
     focus_dpt, pupil_diameter_mm : an initial state, or None
     chart_rows : the rows of a chart, from the top
     follows_gaze : whether its center stays on the line of sight
-    notes : on what the files do not show, or likely mistakes
+    notes : on ignored parts of the files, or likely mistakes
     """
 
     title: str

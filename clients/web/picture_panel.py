@@ -149,7 +149,7 @@ class ScenePanel:
         await self._show()
 
     async def _show(self) -> None:
-        """Show the selected scene, or what it lacks."""
+        """Show the selected scene, or a message about missing input."""
         try:
             if self.kind in TITLES:
                 await self._compute(scene_picture, self.kind)
@@ -343,7 +343,7 @@ class PictureView(Element, component="picture_view.js"):  # type: ignore[call-ar
     def mark_rows(
         self, picture: Picture, smallest_rows: Mapping[EyeSide, int | None]
     ) -> None:
-        """Label the rows of a chart, and describe what each eye reads.
+        """Label the rows of a chart, and describe the smallest row that each eye reads.
 
         Parameters
         ----------

@@ -32,7 +32,7 @@ LENS, LENS_HALF_HEIGHT_MM = "tab:blue", 8.0
 def surface_line_mm(
     surface: Surface, *, half_height_mm: float, n_points: int = N_POINTS
 ) -> NDArray[np.float64]:
-    """Return points (n, 2) of a surface in the plane x = 0 of its own axes, as (z, y).
+    """Return points (n, 2) of a surface in the plane x = 0 of its axes, as (z, y).
 
     Points beyond a closed conic's rim are omitted.
     """

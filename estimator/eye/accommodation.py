@@ -72,7 +72,7 @@ def polynomial_through(
 ) -> BarycentricInterpolator:
     """Return the polynomial through points, with the same rounding in every process.
 
-    SciPy computes the weights in a random order.  With a generator of its own, two
+    SciPy computes the weights in a random order.  With a separate generator, two
     processes prepared one eye with wavefronts that differed by the last bits, and
     images by 1e-7.
     """

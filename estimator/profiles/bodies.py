@@ -304,7 +304,7 @@ MEASUREMENTS_ALLOWED = (
 
 
 def coefficients_allowed(order: int) -> str:
-    """Return what errors say of coefficients up to a radial order."""
+    """Return the allowed coefficients up to a radial order, as text for errors."""
     return f"an object of 'n,m': um with n from 0 to {order}"
 
 
@@ -434,7 +434,7 @@ class CommonBody(Body, kw_only=True):
         list[FileNoteBody],
         Meta(
             max_length=MAX_FILE_NOTES,
-            description="what the reader of a file did not use; replies repeat it",
+            description="parts of a file that the reader ignored; replies repeat them",
             extra={ALLOWED: f"a list of up to {MAX_FILE_NOTES} notes"},
         ),
     ] = msgspec.field(default_factory=list)

@@ -1,7 +1,7 @@
 """Tables of Zernike coefficients: ``.abp`` of the paper's framework, and ``.csv``.
 
 A ``.csv`` file has a row for each term, or one row with a column for each term.
-Settings, such as the pupil, are in lines of their own, in columns or in comments:
+Settings, such as the pupil, are in separate lines, in columns or in comments:
 ``# frame: examiner``.  A setting without its unit, or in another one, is refused, and
 so is a comment or a column that looks like a setting; other entries are named in a
 note.
@@ -70,7 +70,7 @@ _KEY_UNIT = re.compile(r"(.+)_(mm|nm|um|µm|\u03bcm|m|cm|years|year|y)")
 
 
 def key_and_value(text: str) -> tuple[str, str]:
-    """Return what is before and behind the first colon or equals sign, or empty."""
+    """Return the text before and after the first colon or equals sign, or empty."""
     found = re.search("[:=]", text)
     if found is None:
         return "", ""
@@ -268,7 +268,7 @@ def _amount(text: str, where: str) -> tuple[float, str]:
 
 
 TERM_COLUMNS = {"j", "index", "term", "name", "mode"}
-"""Columns that repeat what n and m say."""
+"""Columns that are redundant to n and m."""
 
 _ABP_TERM = re.compile(r"Z\s*\[([^,;\]]+)[,;]([^\]]+)\]\s*=(.*)", re.IGNORECASE)
 _ABP_KEYS = {"ap": "pupil_diameter_mm", "wa": "wavelength_nm"}

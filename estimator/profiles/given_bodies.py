@@ -213,7 +213,7 @@ Media = Annotated[
 
 
 class StateBody(Body, kw_only=True):
-    """The eye at one accommodation; what it omits is as in the relaxed eye."""
+    """The eye at one accommodation; omitted values are as in the relaxed eye."""
 
     accommodation_dpt: Annotated[
         float,
@@ -272,7 +272,7 @@ class SurfacesBody(CommonBody, kw_only=True, tag_field="kind", tag="surfaces"):
 
     surfaces: Surfaces
     stop_z_mm: StopDepthMm
-    # every eye of this kind has a retina of its own
+    # every eye of this kind defines its own retina
     retina: Annotated[  # type: ignore[assignment]
         RetinalSurfaceBody, Meta(description="where light is received")
     ]

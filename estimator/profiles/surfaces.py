@@ -96,7 +96,7 @@ def _check_between(model: SurfaceModel) -> None:
 def _eye(
     state: SurfacesBody | StateBody, body: SurfacesBody, *, path: str
 ) -> EyeSurfaces:
-    """Return the eye in a state; what the state omits is as in the body."""
+    """Return the eye in a state; the body provides values that the state omits."""
 
     def given(name: str) -> Any:
         value = getattr(state, name)

@@ -242,7 +242,7 @@ def with_typical_aberrations(profile: EyeProfile) -> EyeProfile:
 
 
 def typical_note(profile: EyeProfile) -> str:
-    """Return a note on what `with_typical_aberrations` adds to a profile."""
+    """Return a note on the terms that `with_typical_aberrations` adds to a profile."""
     whose = "a young adult"
     if profile.age_years is not None:
         whose = f"{used_age_years(profile.age_years):g} years of age"
@@ -265,17 +265,17 @@ PEOPLE_LIMITS = (2, 1000)
 
 
 def draws_axis(profile: EyeProfile) -> bool:
-    """Return whether a drawn person has higher orders of its own on the axis."""
+    """Return whether drawn persons differ in higher orders on the axis."""
     return profile.kind == "prescription" and profile.higher_order == "typical"
 
 
 def draws_periphery(profile: EyeProfile) -> bool:
-    """Return whether a drawn person has a periphery of its own."""
+    """Return whether drawn persons differ in the periphery."""
     return not profile.is_given and profile.periphery == "people"
 
 
 def drawn_text(profile: EyeProfile) -> str:
-    """Return what differs between drawn persons, and what they have in common."""
+    """Describe the quantities that drawn persons share, and those that differ."""
     drawn = []
     if draws_axis(profile):
         drawn.append("the higher orders on the axis")

@@ -54,7 +54,7 @@ def convert(data: object, kind: Any) -> Any:
         return msgspec.convert(plain, kind)
     except msgspec.ValidationError as error:
         _check(plain, _type_info(kind), "")
-        # msgspec rejects what the walk accepts, for example an integer beyond 64 bits
+        # msgspec also rejects some other values, such as integers beyond 64 bits
         raise ProfileError("profile", str(error), "see the JSON Schema") from None
 
 

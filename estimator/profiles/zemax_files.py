@@ -164,7 +164,7 @@ def _convert_to_mm(file: _File, scale: float) -> None:
 
 
 def _notes(file: _File) -> list[dict[str, Any]]:
-    """Return notes on what the file has besides the eye that is read."""
+    """Return notes on the parts of the file that are not read."""
     notes: list[dict[str, Any]] = []
     words = file.own.get("MNUM", [])[:2]
     configurations = [int(v) for v in words if v.isdecimal() and len(v) < 5]

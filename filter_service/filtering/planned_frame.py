@@ -49,7 +49,7 @@ class Filtered(FrameCounts, WithState):
     """A filtered frame, and the eyes and states that it was filtered with.
 
     The properties `color`, `profile_id`, `generation`, `pupil_diameter_mm`, `focus_dpt`
-    and `gaze_deg` are those of the first view.
+    and `gaze_deg` refer to the first view.
 
     Attributes
     ----------
@@ -96,7 +96,7 @@ class Filtered(FrameCounts, WithState):
 
     @property
     def earlier(self) -> EarlierFrame | None:
-        """Return what is known of an earlier frame in textures; see `ViewResult`."""
+        """Return the results of an earlier frame in textures; see `ViewResult`."""
         return self.views[0].earlier
 
     @property
@@ -290,7 +290,7 @@ def plan_views(
         Returns the `EyeFilter` of an eye, or None.
     views : sequence of RgbdView or TextureView
     states : sequence of ViewState, one for each view
-        Values that are None default to those of the frame.
+        Values that are None default to the frame's values.
     pupil_diameter_mm, focus_dpt, gaze_deg
         Values of the frame, as for `EyeFilter.try_filter`.
 

@@ -294,7 +294,7 @@ PIXEL_BUFFERS = {
     0x88EB: 0x88ED,  # pixel pack
     0x88EC: 0x88EF,  # pixel unpack
 }
-"""Generic bindings that change what transfers of pixels mean."""
+"""Generic bindings that affect pixel transfers."""
 
 SWITCHES = {
     0x0BF2: "logic operation",
@@ -336,7 +336,7 @@ _Ints = ctypes.c_int * 4
 
 
 class KeptState:
-    """Saves what the passes change, and restores it.
+    """Saves the OpenGL state that the passes change, and restores it.
 
     Conditional rendering, transform feedback and queries of elapsed time must not be
     active: they would include the passes.
@@ -372,7 +372,7 @@ class KeptState:
 
     @contextmanager
     def kept(self) -> Iterator[None]:
-        """Save the state and set what the passes need; on exit, restore it."""
+        """Save the state and set the one that the passes need; on exit, restore it."""
         gl, get = self._gl, self._get
         program, vertices = get(GL_CURRENT_PROGRAM), get(GL_VERTEX_ARRAY_BINDING)
         buffers = [(target, get(query)) for target, query in BUFFERS.items()]
@@ -437,7 +437,7 @@ class KeptState:
 
     @contextmanager
     def for_transfers(self) -> Iterator[None]:
-        """Set what moderngl expects for transfers of pixels; on exit, restore it."""
+        """Set the state that moderngl expects for transfers; on exit, restore it."""
         gl = self._gl
         store = [(name, self._get(name)) for name in PIXEL_STORE]
         buffers = [

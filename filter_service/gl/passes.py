@@ -129,7 +129,7 @@ class TextureUnit(Protocol):
 
 
 class PassVariant(NamedTuple):
-    """A compiled pass, and what to bind for it.
+    """A compiled pass and its bindings.
 
     Attributes
     ----------
@@ -238,7 +238,7 @@ class Passes:
         return self.drawings[key]
 
     def forget_bindings(self) -> None:
-        """Forget what is bound, as other code may have changed it."""
+        """Forget the bindings: other code may have changed them."""
         self._bound.clear()
 
     def bind(self, buffers: dict[str, Buffer | BufferPart]) -> None:

@@ -531,7 +531,7 @@ class TextureImporter:
 
 
 def _check_software_memory(descriptor: int, size_bytes: int) -> None:
-    """Check memory of Mesa's software renderer, which maps what its header says.
+    """Check memory of Mesa's software renderer, which maps the size in its header.
 
     Raises
     ------

@@ -203,7 +203,7 @@ class RecipeJob(c.Structure):
 
 
 class VisibilityJob(c.Structure):
-    """Job that finds what sources see; `source/edge_job.h` documents the fields."""
+    """Job for the visibility of sources; `source/edge_job.h` documents the fields."""
 
     _fields_ = (
         ("threads", POINTER),

@@ -4,7 +4,7 @@ grid              specification of a cache, its limits and field directions
 state_samples     sampled states of frames, and the law of errors
 defocus_nodes     nodes of defocus, their blur, and the paper's grid
 node_wavefronts   wavefronts of the field nodes in one state; slopes
-nodes             a plan, its neighbors, and what frames read
+nodes             a plan, its neighbors, and the nodes that frames read
 cost              memory and build time of a plan
 plan              entry point of the package; nodes of the other axes
 

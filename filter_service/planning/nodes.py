@@ -1,4 +1,4 @@
-"""Nodes of a PSF cache as arrays, their neighbors, and what frames read of them."""
+"""Nodes of a PSF cache as arrays, their neighbors, and the nodes that frames read."""
 
 from __future__ import annotations
 

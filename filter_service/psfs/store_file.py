@@ -176,7 +176,7 @@ CheckCancelled = Callable[[], None]
 
 
 class DamagedFile(ValueError):
-    """The content of a file differs from what was written."""
+    """The content of a file differs from the written content."""
 
 
 def write_file(

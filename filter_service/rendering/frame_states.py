@@ -1,4 +1,4 @@
-"""PSF stores of engines, with what only depends on pupil, focus and gaze."""
+"""PSF stores of engines, with data that only depends on pupil, focus and gaze."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """Shared memory and shared textures of clients on this machine.
 
-Descriptors of textures arrive in datagrams of their own.
+Descriptors of textures arrive in separate datagrams.
 """
 
 from __future__ import annotations
@@ -143,7 +143,7 @@ class ClientTextures:
         self._sessions, self._devices, self._send = sessions, devices, send
 
     def offer_to(self, session: Session) -> TextureOffer | None:
-        """Return what to offer to a session, which depends on its device."""
+        """Return the offer to a session, which depends on its device."""
         support = self._devices.device_of(session).texture_support
         if self._socket is None or support is None:
             return None

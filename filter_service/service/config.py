@@ -119,7 +119,7 @@ class ServiceConfig:
         Index of the EGL device for OpenGL; an index selects the engine gl.  "auto" is
         the first device that works, hardware before software.
     devices : tuple of str
-        Devices that filter, each in a process of its own behind the one socket: up to
+        Devices that filter, each in a separate process behind one socket: up to
         eight of ``native``, ``native:THREADS``, ``gl``, ``gl:INDEX`` and ``auto``, as
         in ``devices = ["gl:0", "gl:1"]``.  A new session is assigned to the least busy
         device; a device that cannot be restarted is taken out of service.  Empty: one
@@ -133,7 +133,7 @@ class ServiceConfig:
         Maximum size of that folder; the least recently used entries are evicted.
     threads : int
         CPU threads; 0 uses the cores available to this process, capped by a container's
-        quota.  Devices share them, except those that specify a number of their own.
+        quota.  Devices share them, except devices that specify their own number.
     build_niceness : int
         Niceness of the process that estimates eyes while render workers filter.
     cancel_grace_s : float

@@ -37,7 +37,7 @@ MS_PER_S = 1e3
 
 PSF_BUDGET_S = 1.0
 """Time limit of a frame for computing PSFs, beyond which it is dropped.  The next frame
-keeps what was computed.  A first frame of 1280x720 takes 0.3 to 0.7 s of two cores."""
+reuses the computed PSFs.  A first frame of 1280x720 takes 0.3 to 0.7 s of two cores."""
 
 FilterOf = Callable[[EyeName], EyeFilter]
 """Returns the filter of an eye."""

@@ -323,7 +323,7 @@ class FrontEnd:
             self._fail_work(device)
 
     def _fail_work(self, device: ServedDevice) -> None:
-        """Report to clients what is lost with a render worker."""
+        """Report to clients the frames and profiles lost with a render worker."""
         device.frames.fail_in_flight()
         self._client_textures.report_lost(device)
 

@@ -1,6 +1,6 @@
 """Messages, with file descriptors, between two processes of the service.
 
-Sending never blocks: what the socket does not accept stays in a queue.
+Sending never blocks: bytes that the socket does not accept stay in a queue.
 Messages are pickled, which is safe because both processes belong to the service.
 """
 
@@ -41,7 +41,7 @@ def trim_heap() -> None:
         ctypes.CDLL(None).malloc_trim(0)
 
 
-HEAD = struct.Struct("<QB")  # length of what follows, number of descriptors
+HEAD = struct.Struct("<QB")  # length of the message, number of descriptors
 MAX_DESCRIPTORS = 8
 READ_BYTES = 1 << 18
 
@@ -131,7 +131,7 @@ class Link:
                 self._unsent.popleft()
 
     def _send_some(self, data: memoryview, descriptors: Sequence[int]) -> int:
-        """Send what the socket accepts of a message; return the number of bytes."""
+        """Send the bytes of a message that the socket accepts; return their number."""
         try:
             if descriptors:
                 return socket.send_fds(self._socket, [data], descriptors)

@@ -1,4 +1,4 @@
-"""Reads the bodies of profiles, the larger ones in a process of its own.
+"""Reads the bodies of profiles, the larger ones in a separate process.
 
 Reading 100 measurements takes 5 ms of a processor and 20 surfaces in 8 states 40 ms.
 The interpreter's lock is held meanwhile: in a thread, it would stop the frame loop as

@@ -268,7 +268,7 @@ class RenderClient:
 
     @property
     def shared_quota_bytes(self) -> int:
-        """Return the size limit of what all sessions share together."""
+        """Return the total limit of shared memory over all sessions, in bytes."""
         return int(SHARED_QUOTA * self._slots.max_bytes)
 
     def share(self, size_bytes: int) -> Slot:

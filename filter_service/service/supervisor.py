@@ -284,7 +284,7 @@ class Supervisor:
         return process
 
     def _maintain_standby(self, name: str) -> None:
-        """Keep a standby render worker running, with a build worker of its own."""
+        """Keep a standby render worker running, with its own build worker."""
         standby = self._standbys.get(name)
         if standby is None:
             is_quiet = time.monotonic() - self._spawned_s > STANDBY_AFTER_S

@@ -146,7 +146,7 @@ class Frame(Message):
 
     @property
     def state(self) -> State:
-        """Return the state of views that have none of their own."""
+        """Return the state of views without their own state."""
         return State(self.pupil_diameter_mm, self.focus_dpt, self.gaze_deg)
 
     @property

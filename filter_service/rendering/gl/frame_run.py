@@ -414,7 +414,7 @@ class FrameRun:
         )
 
     def fill(self, psfs: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Compute the missing PSFs of a frame, timed as a stage of its own."""
+        """Compute the missing PSFs of a frame, timed as a separate stage."""
         with self.timer.wall("psf_compute_ms"):
             left = self._eye.handle.store.fill(psfs, until_s=self._request.until_s)
         if left.size:

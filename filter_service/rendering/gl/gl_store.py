@@ -39,7 +39,7 @@ class GlStore(FrameStore):
         return low_dpt - margin, high_dpt + margin
 
     def sync(self) -> tuple[Pages, dict[str, BufferPart]]:
-        """Upload what has changed since the last call.
+        """Upload changes since the last call.
 
         The caller makes the OpenGL context current.
 

@@ -317,7 +317,7 @@ class KernelRun:
     def group_counts(self) -> tuple[int, int]:
         """Work groups of the passes that clear a plan and list its kernels.
 
-        They are rounded, so that few states have a number of their own.
+        They are rounded, so that only few states have separate numbers.
         """
         uniforms = self.uniforms
         used_words = uniforms["used_words"]
@@ -443,7 +443,7 @@ class KernelRun:
     def to_read(
         self, stats: NDArray[np.uint32]
     ) -> list[tuple[Buffer, int, NDArray[Any]]]:
-        """Return what to read back, for `Gpu.begin_read`, with the frame's counters."""
+        """Return the buffers for `Gpu.begin_read`, including the frame's counters."""
         targets = {"STATS": stats, "PLAN": self.counts, "READ_PSFS": self.read_words}
         found = []
         for name, target in targets.items():
@@ -500,7 +500,7 @@ class KernelRun:
         return True
 
     def keep_headroom(self, ratio: float) -> None:
-        """Keep the buffers larger than what the frame used, for frames that need more.
+        """Keep the buffers larger than the frame required, for frames that need more.
 
         Parameters
         ----------

@@ -305,7 +305,7 @@ class TextureFrames:
         *,
         is_counted: bool,
     ) -> tuple[Any, ...]:
-        """Return what the passes of a frame depend on, besides buffers and state."""
+        """Return the values that the passes depend on, besides buffers and state."""
         request, view, target = given
         gpu, image = self._gpu, state.image
         return (

@@ -304,7 +304,7 @@ class NativeRenderer(OneView):
         until_s: float | None,
         psfs: NDArray[np.int64],
     ) -> NDArray[np.int64]:
-        """Compute the missing PSFs of a frame, timed as a stage of its own."""
+        """Compute the missing PSFs of a frame, timed as a separate stage."""
         with timer.wall("psf_compute_ms"):
             return handle.store.fill(
                 psfs, until_s=until_s, between=self._pause_callback
