@@ -27,8 +27,8 @@ MAX_HEADER_BYTES = 64_000_000
 much memory."""
 
 MAX_HEADER_ITEMS = 1_000_000
-"""Number of values in the JSON, which take a second to parse: enough for 50,000 nodes,
-meshes and accessors."""
+"""Number of values in the JSON: enough for 50,000 nodes, meshes and accessors, which
+take a second to parse."""
 
 MAX_HEADER_DEPTH = 64
 """Nesting depth of the JSON, whose extras may contain anything."""

@@ -190,7 +190,7 @@ def patch(
     uv_scale: tuple[float, float] = (1, 1),
     **look: Unpack[Look],
 ) -> Mesh:
-    """Return a flat parallelogram whose front faces side_u × side_v."""
+    """Return a flat parallelogram with the normal side_u × side_v."""
     nu, nv = cells
     grid = np.meshgrid(np.linspace(0, 1, nu + 1), np.linspace(0, 1, nv + 1))
     u, v = (values.ravel() for values in grid)

@@ -66,7 +66,7 @@ def lens_shape(*, diameter_mm: ArrayLike, volume_mm3: ArrayLike) -> LensShape:
     """Return the lens shape by rule C, the paraboloid-equivalent volume.
 
     h_A + h_P = 8 eta V / (pi D²), R_P = -pi D⁴ (1 + tau) / (64 eta V), R_A = -R_P / tau
-    with tau = h_A / h_P.  It is always feasible and monotonic in D.  The conic
+    with tau = h_A / h_P.  The solution always exists and is monotonic in D.  The conic
     constants shape only the surfaces.
 
     Raises

@@ -199,7 +199,7 @@ def _pupils_mm(low_mm: float, high_mm: float) -> NDArray[np.float64]:
 def network_focused(
     eye: EstimatedEye, accommodations_dpt: ArrayLike
 ) -> list[FocusedEye]:
-    """Return the eye at accommodations (n,) within its amplitude.
+    """Return the eye in accommodated states (n,) within its amplitude.
 
     The focus network predicts the accommodated states.  Only one of its two outputs is
     used, the lens diameter: the chamber depth follows from the diameter by the rule of
