@@ -45,7 +45,6 @@ from filter_service.messages import (
     EyeName,
     FilterSettings,
     Frame,
-    Ping,
     Pong,
     ProfileRequest,
     Progress,
@@ -66,7 +65,6 @@ from filter_service.settings import (
     RenderOptionValues,
     as_settings,
 )
-from filter_service.waiting import Wait
 
 __all__ = ["Event", "FilterClient", "FilteredFrame", "RgbdView", "ViewState"]
 
@@ -585,19 +583,7 @@ class FilterClient:
 
     def ping(self, timeout_s: float | None = None) -> tuple[float, Pong]:
         """Return the round trip in ms, and the state of the service's render worker."""
-        limit_s = self.timeout_s if timeout_s is None else timeout_s
-        self._link.pongs.clear()
-        start_s, asked = time.monotonic(), None
-        with Wait("Waiting for the service", limit_s) as wait:
-            while not self._link.pongs:
-                if self.welcome is not asked and self.welcome is not None:
-                    # Also after a lost connection, with which the reply was lost.
-                    asked, start_s = self.welcome, time.monotonic()
-                    self._link.queue_message(encode(Ping(start_s)))
-                    self._link.pump(0.0)
-                else:
-                    self._link.pump_during(wait, "a reply to ping")
-        return 1000 * (time.monotonic() - start_s), self._link.pongs[-1]
+        return self._link.ping(self.timeout_s if timeout_s is None else timeout_s)
 
 
 if TYPE_CHECKING:  # mypy checks here that the class implements the protocol

@@ -33,6 +33,7 @@ from filter_service.messages import (
     EyeName,
     Frame,
     Hello,
+    Ping,
     Pong,
     ProfileRequest,
     Progress,
@@ -312,6 +313,21 @@ class ServiceLink:
             if event is not None:
                 return
             self.pump_during(wait, "the eye to be prepared for this camera")
+
+    def ping(self, timeout_s: float) -> tuple[float, Pong]:
+        """Return the round trip in ms, and the reply."""
+        self.pongs.clear()
+        start_s, asked = time.monotonic(), None
+        with Wait("Waiting for the service", timeout_s) as wait:
+            while not self.pongs:
+                if self.welcome is not asked and self.welcome is not None:
+                    # Also after a lost connection, with which the reply was lost.
+                    asked, start_s = self.welcome, time.monotonic()
+                    self.queue_message(encode(Ping(start_s)))
+                    self.pump(0.0)
+                else:
+                    self.pump_during(wait, "a reply to ping")
+        return 1000 * (time.monotonic() - start_s), self.pongs[-1]
 
     def pump_during(self, wait: Wait, what: str) -> None:
         """Pump once; raise at the time limit or if the service rejected hello."""

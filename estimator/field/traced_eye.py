@@ -159,7 +159,7 @@ class TracedEye(FocusingEye):
             Azimuths and elevations that are traced, ends of the range included; others
             are not interpolated well.  By default Chebyshev nodes.
         field_grid : callable, optional
-            Function that traces the grid; `few_colors.few_colors_grid` takes half the
+            Function that traces the grid; `prepare.few_colors_grid` takes half the
             time of the default.
         progress : callable, optional
             Callback with the completed fraction; may raise to cancel.
