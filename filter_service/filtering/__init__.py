@@ -9,7 +9,7 @@ eye_filter        `EyeFilter`: one stream
 planned_frame     a frame whose eyes are prepared, and `Filtered`
 stream_eyes       the profiles of a stream, their stores and events, and its frames
 builder           builder and engine shared by all streams
-turns             turns of frames and of the thread that prepares eyes
+priority_lock     lock of frames and of the thread that prepares eyes
 shared_builder    builders shared within a process, and the choice of their engine
 """
 

@@ -35,6 +35,7 @@ from filter_service.errors import (
     FilterError,
     RenderFailed,
 )
+from filter_service.filtering.priority_lock import PriorityLock, Signal
 from filter_service.filtering.stream_eyes import (
     AcceptedProfile,
     BuildingEye,
@@ -46,7 +47,6 @@ from filter_service.filtering.stream_eyes import (
     Preparing,
     StreamEyes,
 )
-from filter_service.filtering.turns import Signal, Turns
 from filter_service.rendering.engine import FrameEngine
 from filter_service.rendering.frame_kernels import first_frame
 from filter_service.rendering.frame_states import FrameStore
@@ -93,8 +93,8 @@ class Builder:
     """Builds eyes in the build worker, and computes PSFs before frames need them.
 
     A thread does both, from the first profile on.  It and the calls of the builder's
-    methods take turns; a call waits for one batch of PSFs at most.  The thread uses no
-    OpenGL, and no events are delivered in it.
+    methods exclude each other; a call waits for one batch of PSFs at most.  The thread
+    uses no OpenGL, and no events are delivered in it.
 
     Parameters
     ----------
@@ -134,7 +134,7 @@ class Builder:
         self._thread: threading.Thread | None = None
         self._is_closed = False
         self._wake = Signal()
-        self._turns = Turns()
+        self._lock = PriorityLock()
 
     @property
     def stores_mb(self) -> float:
@@ -154,31 +154,35 @@ class Builder:
     @contextmanager
     def frame(self) -> Iterator[None]:
         """Exclude preparation while a frame is begun, after the time that it gets."""
-        self._turns.wait_until_paid(FIRST_RANGE_S[1])
-        with self.turn():
+        self._lock.wait_for_reserved(FIRST_RANGE_S[1])
+        with self.exclusive():
             yield
 
-    def turn(self) -> AbstractContextManager[None]:
+    def exclusive(self) -> AbstractContextManager[None]:
         """Exclude preparation during a call, which goes first."""
-        return self._turns.call()
+        return self._lock.foreground()
 
     def end_frame(self, stream: StreamEyes, duration_s: float) -> None:
         """Note that a frame was rendered, and deliver the events of its stream."""
         self.frame_s = duration_s
         # A frame that interrupts another cannot wait.
-        if self._thread and not self._turns.has_calls and self._to_warm() is not None:
+        if (
+            self._thread
+            and not self._lock.has_foreground
+            and self._to_warm() is not None
+        ):
             low_s, high_s = FIRST_RANGE_S
-            self._turns.owe(min(max(FIRST_SHARE * duration_s, low_s), high_s))
+            self._lock.reserve(min(max(FIRST_SHARE * duration_s, low_s), high_s))
         self._wake.set()
         self.deliver(stream)
 
-    def lend_turn(self) -> None:
+    def let_thread_work(self) -> None:
         """Let the thread work during a frame that pauses, if it has anything to do."""
-        self._turns.lend(FIRST_RANGE_S[1])
+        self._lock.pause(FIRST_RANGE_S[1])
 
     def trim(self) -> None:
         """Release buffers of the engine after an idle period."""
-        with self.turn():
+        with self.exclusive():
             self.engine.trim()
 
     # Events
@@ -243,7 +247,7 @@ class Builder:
 
         The parameters are the same as for `StreamEyes.add_profile`.
         """
-        with self.turn():
+        with self.exclusive():
             # Also one whose build has not started: its sender expects an outcome.
             building = stream.building
             replaced = [building.eye] if building is not None else []
@@ -270,7 +274,7 @@ class Builder:
     ) -> tuple[AcceptedProfile, list[FrameStore]] | Preparing:
         """Return the eye and the store of each view; see `StreamEyes.plan`."""
         self.await_event(stream)
-        with self.turn():
+        with self.exclusive():
             plan = stream.plan(cameras, newest_only=newest_only)
             has_work = stream.next_build() is not None
         if has_work:  # otherwise predictions would go before the frame
@@ -280,7 +284,7 @@ class Builder:
 
     def end(self, stream: StreamEyes) -> None:
         """End a stream and release its eyes."""
-        with self.turn():
+        with self.exclusive():
             if stream in self.streams:
                 self.streams.remove(stream)
             self._cancel(stream)
@@ -313,7 +317,7 @@ class Builder:
         """Free the stores that a stream has retired, unless frames are unfinished."""
         if stream.begun or not stream.retired:
             return
-        with self.turn():
+        with self.exclusive():
             retired, stream.retired = stream.retired, []
             for store in retired:
                 store.release()
@@ -326,8 +330,8 @@ class Builder:
     def _run(self) -> None:
         """Prepare eyes until the builder is closed."""
         while not self._is_closed:
-            with self._turns.work() as has_turn:
-                if not has_turn:
+            with self._lock.background() as may_work:
+                if not may_work:
                     continue
                 try:
                     has_more = self._step()
@@ -335,9 +339,9 @@ class Builder:
                     log.exception("eyes could not be prepared")
                     has_more = False
                 if self._to_warm() is None:
-                    self._turns.owe(0.0)
+                    self._lock.reserve(0.0)
                 if not has_more:
-                    self._turns.end_loan()
+                    self._lock.resume()
             if self._drop_released() or has_more:
                 continue
             worker = self.worker.file_descriptor
@@ -523,7 +527,7 @@ class Builder:
                 left = store.missing_psfs(last, state=state)
                 while left.size:
                     left = _without_batch(store, left)
-                    if self._turns.has_calls:  # their frame may need other PSFs
+                    if self._lock.has_foreground:  # their frame may need other PSFs
                         return True
         except Exception as error:  # a frame that needs the PSFs reports it
             log.info(

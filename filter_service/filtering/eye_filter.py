@@ -560,7 +560,7 @@ class EyeFilter:
         """
         arrays = [view for view in views if isinstance(view, RgbdView)]
         if arrays:
-            with self.builder.turn():
+            with self.builder.exclusive():
                 self._eyes.history.record(arrays, states[0], at_s=time.monotonic())
         cameras = [view.camera for view in views]
         found = self.builder.plan(self._eyes, cameras, newest_only=newest_only)

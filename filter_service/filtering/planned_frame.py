@@ -153,7 +153,7 @@ class PlannedView:
 
     def finish(self, begun: Pending, started_s: float) -> ViewResult | None:
         """Wait for the view; return None if PSFs are missing."""
-        with self.builder.turn():
+        with self.builder.exclusive():
             found = begun()
             if isinstance(found, MissingPsfs):
                 return None

@@ -226,7 +226,7 @@ class RenderWorker:
         if is_short:
             return
         if self._frame_since_s is not None:
-            self._builder.lend_turn()
+            self._builder.let_thread_work()
         self._builder.deliver_all()
         if self._frame_since_s is None and self._is_time_to_trim:
             self._trim_at_s = None

@@ -1,4 +1,4 @@
-"""Turns of calls and of the thread that prepares eyes: calls go first."""
+"""The lock of calls and of the thread that prepares eyes: calls come first."""
 
 import select
 import threading
@@ -6,29 +6,29 @@ import time
 
 import pytest
 
-from filter_service.filtering.turns import Signal, Turns
+from filter_service.filtering.priority_lock import PriorityLock, Signal
 
 LIMIT_S = 20.0
 
 
 class Working:
-    """A thread that takes every turn that it gets."""
+    """A thread that works whenever it may."""
 
     def __init__(self):
-        self.turns, self.n_pieces, self.has_ended = Turns(), 0, False
+        self.lock, self.n_pieces, self.has_ended = PriorityLock(), 0, False
         self.thread = threading.Thread(target=self.run)
 
     def run(self):
         while not self.has_ended:
-            with self.turns.work() as has_turn:
-                self.n_pieces += has_turn
+            with self.lock.background() as may_work:
+                self.n_pieces += may_work
                 time.sleep(0.001)
 
     def await_piece(self):
         """Wait until a whole piece has been done."""
         before, end_s = self.n_pieces, time.monotonic() + LIMIT_S
         while self.n_pieces < before + 2:
-            assert time.monotonic() < end_s, "the thread got no turn"
+            assert time.monotonic() < end_s, "the thread did not work"
             time.sleep(0.001)
 
 
@@ -43,33 +43,33 @@ def working():
 
 def test_no_piece_is_done_during_a_call(working):
     working.await_piece()
-    with working.turns.call():
+    with working.lock.foreground():
         before = working.n_pieces
-        with working.turns.call():
+        with working.lock.foreground():
             time.sleep(0.01)
         time.sleep(0.01)
         assert working.n_pieces == before
     working.await_piece()
 
 
-def test_a_call_that_pauses_lends_its_turn(working):
+def test_a_call_that_pauses_lets_the_thread_work(working):
     working.await_piece()
-    with working.turns.call():
+    with working.lock.foreground():
         end_s = time.monotonic() + LIMIT_S
         before = working.n_pieces
         while working.n_pieces == before and time.monotonic() < end_s:
-            working.turns.lend(0.01)
+            working.lock.pause(0.01)
         assert working.n_pieces > before
         before = working.n_pieces
         time.sleep(0.01)
         assert working.n_pieces == before
 
 
-def test_calls_that_follow_each_other_wait_for_what_they_owe(working):
-    with working.turns.call():
+def test_a_call_waits_until_the_reserved_time_is_used(working):
+    with working.lock.foreground():
         before = working.n_pieces
-        working.turns.owe(0.005)
-    working.turns.wait_until_paid(LIMIT_S)
+        working.lock.reserve(0.005)
+    working.lock.wait_for_reserved(LIMIT_S)
     assert working.n_pieces > before
 
 
