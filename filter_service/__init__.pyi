@@ -18,6 +18,7 @@ from .rgbd_view import as_views as as_views
 from .settings import Accumulation as Accumulation
 from .settings import FilterSettings as FilterSettings
 from .settings import Output as Output
+from .settings import RenderOptions as RenderOptions
 from .texture_view import DepthProjection as DepthProjection
 from .texture_view import GlTexture as GlTexture
 from .texture_view import TextureView as TextureView

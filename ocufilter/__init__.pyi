@@ -77,6 +77,7 @@ from filter_service import FilterSettings as FilterSettings
 from filter_service import GlTexture as GlTexture
 from filter_service import Output as Output
 from filter_service import Preparing as Preparing
+from filter_service import RenderOptions as RenderOptions
 from filter_service import RgbdView as RgbdView
 from filter_service import TextureView as TextureView
 from filter_service import ViewState as ViewState

@@ -345,12 +345,7 @@ class EyeFilter:
             Longest time in which neither the build of an eye nor the computation of its
             PSFs advances.
         **options
-            Fields of `RenderOptions`: ``accumulation="coverage"`` or ``"paper"``
-            (nearer surfaces occlude farther ones, or the published sum), ``merge=True``
-            (similar pixels share a splat; off is slower), ``render_tolerance=1.0``
-            (0 is exact, 1 leaves no visible difference, up to 8 is faster), and
-            ``peripheral_merging=False`` (on is faster for a viewer who looks along
-            ``gaze_deg``; without a gaze it has no effect).
+            Fields of `RenderOptions`, such as ``render_tolerance=0``, which is exact.
 
         Returns
         -------

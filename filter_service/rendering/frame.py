@@ -29,7 +29,7 @@ Values of both as digitized for castleCSF (github.com/gfxdisp/castleCSF).
 from collections.abc import Callable
 from dataclasses import replace
 from math import ceil
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -230,6 +230,34 @@ def merge_gaze(
         return NO_GAZE
     right, up, backward = unit_direction(*gaze_deg).tolist()
     return right, up, -backward
+
+
+class Merging(NamedTuple):
+    """How a frame merges pixels and distances, which follows from its options.
+
+    Attributes
+    ----------
+    tolerance : float
+        Rendering error relative to the default; 0 merges no pixels.
+    gaze : GazeDirection
+    paper_rule : bool
+        Whether light of several distances is combined as in the paper.
+    """
+
+    tolerance: float
+    gaze: GazeDirection
+    paper_rule: bool
+
+    @classmethod
+    def of(
+        cls, options: RenderOptions, gaze_deg: tuple[float, float] | None
+    ) -> "Merging":
+        """Return the values for a frame with a gaze, see `merge_gaze`."""
+        return cls(
+            options.render_tolerance if options.merge else 0.0,
+            merge_gaze(options, gaze_deg),
+            options.accumulation == "paper",
+        )
 
 
 def follows_gaze(options: RenderOptions) -> bool:

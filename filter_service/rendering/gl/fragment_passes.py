@@ -16,7 +16,7 @@ from filter_service.constants import (
     STAT_WORDS,
     THREADS,
 )
-from filter_service.rendering.frame import GazeDirection
+from filter_service.rendering.frame import Merging
 from filter_service.rendering.gl.kernel_passes import KernelRun, words_per_cell
 from filter_service.rendering.gl.strip import Strip, group_count
 from filter_service.rendering.image_cells import ImageCells
@@ -38,10 +38,7 @@ class FragmentPasses:
     strip : Strip
     image : ImageCells
         Cells of the whole frame.
-    tolerance : float
-        Merging error relative to the default; 0 disables merging.
-    gaze : GazeDirection
-        Gaze that merging follows.
+    merging : Merging
     first_row : int
         First row of the strip within the frame.
     frame_pixel_count : int
@@ -71,8 +68,7 @@ class FragmentPasses:
         strip: Strip,
         *,
         image: ImageCells,
-        tolerance: float,
-        gaze: GazeDirection,
+        merging: Merging,
         first_row: int,
         frame_pixel_count: int,
         image_size_px: tuple[int, int],
@@ -84,8 +80,7 @@ class FragmentPasses:
     ):
         self.strip = strip
         self.image = image
-        self.tolerance = tolerance
-        self.gaze = gaze
+        self.merging = merging
         self.first_row = first_row
         self.scan = (first_row * strip.size[0], frame_pixel_count)
         self.image_size_px = image_size_px
@@ -160,9 +155,9 @@ class FragmentPasses:
                     max_level=self._max_level,
                     white_level=self.white_level,
                     is_encoded=int(self.is_encoded),
-                    tolerance=self.tolerance,
+                    tolerance=self.merging.tolerance,
                     tangents=self.strip.view.tangents,
-                    gaze_direction=self.gaze,
+                    gaze_direction=self.merging.gaze,
                     paper_order=int(self.strip.paper_rule),
                     scan_px=self.scan,
                     surface=surface,
@@ -171,7 +166,7 @@ class FragmentPasses:
     @property
     def _max_level(self) -> int:
         """Highest level of merging; the paper has one level."""
-        if self.tolerance == 0.0:
+        if self.merging.tolerance == 0.0:
             return 0
         highest = 1 if self.strip.paper_rule else MAX_LEVEL
         cell_px = self.image.cell_px

@@ -26,11 +26,11 @@ from filter_service.gl.stage_timer import StageTimer
 from filter_service.psfs.frame_layers import FrameLayers
 from filter_service.rendering.engine import ViewRequest
 from filter_service.rendering.frame import (
+    Merging,
     border_px_of,
     drop_empty_layer,
     extended,
     fill_missing_depth,
-    merge_gaze,
     reach_px_of,
     white_level,
 )
@@ -383,20 +383,20 @@ class FrameRun:
 
     def passes_of(self, plan: _Plan, rows: Rows) -> FramePasses:
         """Return the passes of a strip."""
-        image, options = plan.state.image, self._request.options
+        request, image = self._request, plan.state.image
+        merging = Merging.of(request.options, request.state.gaze_deg)
         strip = Strip(
             self._gpu,
             rows.view,
             self.timer,
             layers=self.layers,
-            paper_rule=options.accumulation == "paper",
+            paper_rule=merging.paper_rule,
         )
         fragments = ArrayFragments(
             strip,
             rows.view,
             image=image,
-            tolerance=options.render_tolerance if options.merge else 0.0,
-            gaze=merge_gaze(options, self._request.state.gaze_deg),
+            merging=merging,
             first_row=rows.first_row,
             frame_pixel_count=plan.whole.width_px * plan.whole.height_px,
             image_size_px=(self._view.width_px, self._view.height_px),

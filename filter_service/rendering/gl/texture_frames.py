@@ -34,7 +34,7 @@ from filter_service.gl.stage_timer import Untimed
 from filter_service.gl.texture_io import TextureIo
 from filter_service.psfs.frame_layers import FrameLayers
 from filter_service.rendering.engine import ViewRequest
-from filter_service.rendering.frame import merge_gaze
+from filter_service.rendering.frame import Merging
 from filter_service.rendering.gl.fragment_passes import FragmentPasses
 from filter_service.rendering.gl.frame_run import EyeState
 from filter_service.rendering.gl.kernel_passes import FrameState, KernelRun
@@ -313,7 +313,7 @@ class TextureFrames:
             *(view.width_px, view.height_px, view.tangents, view.projection),
             *(view.is_top_first, view.white_ratio),
             *(target.format == "rgba16f", request.options),
-            merge_gaze(request.options, request.state.gaze_deg),
+            Merging.of(request.options, request.state.gaze_deg),
             *(image.cell_px, image.grid, kernels.capacity, kernels.group_counts),
             *(gpu.buffers[name].size for name in LISTS if name in gpu.buffers),
             is_counted,
@@ -329,14 +329,15 @@ class TextureFrames:
     ) -> _Passes:
         """Dispatch the passes of a frame, and record them."""
         request, view, target = given
-        gpu, options = self._gpu, request.options
+        gpu = self._gpu
+        merging = Merging.of(request.options, request.state.gaze_deg)
         state = kernels.state
         strip = Strip(
             gpu,
             view,
             Untimed(),
             layers=state.layers,
-            paper_rule=options.accumulation == "paper",
+            paper_rule=merging.paper_rule,
         )
         size_px = view.width_px, view.height_px
         fragments = TextureFragments(
@@ -344,8 +345,7 @@ class TextureFrames:
             view,
             self._io,
             image=state.image,
-            tolerance=options.render_tolerance if options.merge else 0.0,
-            gaze=merge_gaze(options, request.state.gaze_deg),
+            merging=merging,
             first_row=0,
             frame_pixel_count=strip.pixel_count,
             image_size_px=size_px,

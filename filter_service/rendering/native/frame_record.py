@@ -30,7 +30,7 @@ from filter_service.native.records import (
 from filter_service.psfs.frame_layers import FrameLayers
 from filter_service.psfs.pack import StoreTables, box_sizes, pack_reach, unpack_reach
 from filter_service.psfs.store import PsfStore
-from filter_service.rendering.frame import GazeDirection
+from filter_service.rendering.frame import Merging
 from filter_service.rendering.frame_kernels import (
     Fill,
     FrameKernels,
@@ -439,16 +439,10 @@ class FrameRecord:
         c.kernels = eye_buffer("kernels", c.kernel_count * KERNEL_IMAGE_BYTES, np.uint8)
 
     def set_merging(
-        self,
-        *,
-        tolerance: float,
-        gaze: GazeDirection,
-        paper_rule: bool,
-        white_level: float,
-        is_encoded: bool,
+        self, merging: Merging, *, white_level: float, is_encoded: bool
     ) -> None:
-        """Set the options of merging and accumulation; the paper has one level."""
-        c = self.c
+        """Set how the frame is merged; the paper has one level."""
+        c, (tolerance, gaze, paper_rule) = self.c, merging
         c.paper_rule, c.white_level = paper_rule, white_level
         c.is_encoded = is_encoded and white_level > 0.0
         most = 1 if paper_rule else MAX_LEVEL

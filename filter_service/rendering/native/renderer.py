@@ -26,11 +26,11 @@ from filter_service.rendering.engine import (
     output_array,
 )
 from filter_service.rendering.frame import (
+    Merging,
     border_px_of,
     drop_empty_layer,
     extended,
     fill_missing_depth,
-    merge_gaze,
     white_level,
 )
 from filter_service.rendering.frame_kernels import Fill, MissingPsfs
@@ -206,7 +206,7 @@ class NativeRenderer(OneView):
         image: ImageCells,
         fill: Fill,
     ) -> ViewResult | MissingPsfs:
-        timer, options = request.times, request.options
+        timer = request.times
         frame = FrameRecord.new(
             self._threads, self._n_threads, self._arrays, eye.arrays
         )
@@ -222,9 +222,7 @@ class NativeRenderer(OneView):
             if white is None:
                 white = white_level(view.color)
             frame.set_merging(
-                tolerance=options.render_tolerance if options.merge else 0.0,
-                gaze=merge_gaze(options, request.state.gaze_deg),
-                paper_rule=options.accumulation == "paper",
+                Merging.of(request.options, request.state.gaze_deg),
                 white_level=white,
                 is_encoded=request.output == "srgb8",
             )
