@@ -90,7 +90,7 @@ class SharedTextures:
         """Log why textures are not shared, once."""
         if reason != self._reported:
             self._reported = reason
-            log.warning("no shared textures, send images instead: %s", reason)
+            log.warning("cannot share textures; sending images instead: %s", reason)
 
 
 KEPT_RATIO = 4

@@ -26,7 +26,7 @@ def serve(
     engine: Annotated[
         Engine | None,
         typer.Option(
-            help="gl: shaders on a GPU; native: compiled loops; auto: gl on a GPU."
+            help="gl: shaders; native: compiled C; auto: gl if there is a GPU."
         ),
     ] = None,
     gl_device: Annotated[
@@ -86,7 +86,7 @@ def serve(
 
 
 def main() -> None:
-    """Run the service with the options of `ocufilter serve`, which need no client.
+    """Run `ocufilter serve` without importing the client package.
 
     python -m filter_service serve --bind tcp://127.0.0.1:5577
     """

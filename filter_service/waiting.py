@@ -1,4 +1,4 @@
-"""Waits of the Python API: a limit of the time without progress, and a bar meanwhile.
+"""Timeouts and progress bars for blocking calls of the Python API.
 
     with Wait("Preparing the eye", timeout_s) as wait:
         while not is_ready():
@@ -24,20 +24,20 @@ from filter_service.progress import Progress, Task, is_progress_open
 
 SHOWN_AFTER_S = 2.0
 WATCH_S = 0.5
-"""Interval at which the watching thread looks for waits that take long."""
+"""Interval at which the watcher thread checks for long waits."""
 
 PROGRESS_VARIABLE = "OCUFILTER_PROGRESS"
 
 
 class Wait:
-    """A wait for work that advances.
+    """Timeout and progress bar of one blocking call.
 
     Parameters
     ----------
     title : str
         Name of the work, for the bar.
     timeout_s : float
-        Longest time without an advance; unlimited by default.
+        Maximum time without progress; unlimited by default.
     is_shown : bool
         Whether to show a bar; not if the caller reports the progress itself.
     """
@@ -59,7 +59,7 @@ class Wait:
         self._bar: tuple[Progress, Task] | None = None
 
     def __enter__(self) -> Self:
-        """Start the time after which the bar appears."""
+        """Start watching, so that a bar appears if the wait is long."""
         if self._is_shown and _has_terminal():
             self._is_watched = True
             _watcher.watch(self)
@@ -77,29 +77,29 @@ class Wait:
 
     @property
     def remaining_s(self) -> float:
-        """Return the time that remains for the next advance."""
+        """Return the time left until the timeout, unless the work progresses."""
         return self._end_s - time.monotonic()
 
     def is_over(self) -> bool:
-        """Return whether the time limit has passed, at the last call as well.
+        """Return whether the timeout has expired, now and at the previous call.
 
-        If the program itself was suspended, it first reads messages that have arrived
-        meanwhile.
+        Requiring two calls lets a program that was suspended read the messages that
+        have arrived in the meantime.
         """
         was_overdue, self._is_overdue = self._is_overdue, self.remaining_s <= 0.0
         return was_overdue and self._is_overdue
 
     def advance(self) -> None:
-        """Restart the time limit: the work has advanced."""
+        """Restart the timeout, because the work has progressed."""
         self._end_s = time.monotonic() + self._timeout_s
 
     def update(self, mark: Any, fraction: float | None = None, stage: str = "") -> None:
-        """Restart the time limit if the work has advanced, and update the bar.
+        """Restart the timeout if the work has progressed, and update the bar.
 
         Parameters
         ----------
         mark : object
-            Value that differs from the last one once the work has advanced.
+            Any value that changes whenever the work progresses.
         fraction : float, optional
             Completed fraction, 0 to 1, if it is known.
         stage : str
@@ -138,8 +138,8 @@ class Wait:
 class _Watcher:
     """Thread that opens the bars of long waits.
 
-    A thread, because who waits may compute for seconds; one for all, because a thread
-    for each frame took 0.2 ms.
+    It is a thread because the waiting thread may compute for seconds.  All waits share
+    it because starting a thread for each frame took 0.2 ms.
     """
 
     def __init__(self) -> None:

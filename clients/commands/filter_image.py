@@ -146,7 +146,7 @@ def filter_image(
     engine: Annotated[
         Engine,
         typer.Option(
-            help="gl: shaders on a GPU; native: compiled loops; auto: gl on a GPU."
+            help="gl: shaders; native: compiled C; auto: gl if there is a GPU."
         ),
     ] = "auto",
     half: Annotated[

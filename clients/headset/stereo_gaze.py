@@ -236,7 +236,7 @@ class StereoGaze:
         return tuple(found)
 
     def restart(self) -> None:
-        """Reset all state: the clock of a new runtime may start again."""
+        """Reset all state: a new runtime may restart its clock."""
         self._follower = GazeFollower()
         self._eyes = {}
         self._distance_m = None

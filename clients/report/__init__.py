@@ -1,7 +1,7 @@
 """Reports of simulated eyes: `ocufilter report` and `report_html`.
 
 program    the command
-make       reports from profiles, and their identification
+make       builds reports from profiles, and identifies them
 facts      computed content of a report on one eye: numbers, letter charts, names
 text       sentences: corrections, method, provenance, literature references
 tables     tables of a report

@@ -363,7 +363,7 @@ def leaves(
     Parameters
     ----------
     base_m, along, facing : (n, 3) arrays
-        Foot, direction and upward normal of each leaf; the last two need not be unit
+        Base, direction and upward normal of each leaf; the last two need not be unit
         vectors.
     length_m, width_m : float
         Mean size.
@@ -395,7 +395,7 @@ def leaves(
     mesh = new_mesh(vertices, faces, normals=np.repeat(up, per_leaf, axis=0))
     palette = np.array([linear_from_hex(color) for color in colors])
     tint = palette[rng.integers(len(palette), size=n)] * rng.uniform(0.75, 1.2, (n, 1))
-    # A pale midrib and a darker foot make leaves recognizable at close range.
+    # A pale midrib and a darker base make leaves recognizable at close range.
     shade = np.ones((len(s), 3, 1)) * np.array([1.0, 1.25, 1.0])[None, :, None]
     shade = shade * (0.75 + 0.35 * s)[:, None, None]
     albedo = np.clip(tint[:, None, None] * shade, 0, 1).reshape(-1, 3)
@@ -426,7 +426,7 @@ def branch(
     rng: np.random.Generator,
     colors: Sequence[str] = GREENS,
 ) -> Mesh:
-    """Return a twig with leaves on two sides, with details for a distance of 0.3 m."""
+    """Return a twig with leaves on two sides, detailed enough to view from 0.3 m."""
     path_m = np.asarray(path_m, float)
     taper = np.linspace(radius_m, 0.3 * radius_m, len(path_m))
     bark = tube(path_m, taper, sides=6, color="#5b4632")

@@ -286,7 +286,7 @@ class Batch:
     uv : (n, 2) float32
         Texture coordinates.
     srgb : (n, 3) float32
-        sRGB-encoded light of the vertices; with a texture, the factor on its values.
+        sRGB-encoded light of the vertices, multiplied by the texture, if there is one.
     texture : (h, w, 3) uint8 or None
         sRGB.
     """
@@ -335,7 +335,7 @@ class Scene:
 def finished(mesh: Mesh, light: Array, textures: dict[str, NDArray[np.uint8]]) -> Batch:
     """Convert a mesh and the light (n, 3) on its vertices to a draw call."""
     if mesh.texture:
-        # The product of two powers is the power of the product, unlike with sRGB.
+        # A power law is multiplicative; the sRGB curve is not.
         srgb = np.maximum(mesh.albedo * light + mesh.emission, 0.0) ** (1 / 2.2)
     else:
         srgb = srgb_from_linear(mesh.albedo * light + mesh.emission)

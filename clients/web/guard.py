@@ -51,7 +51,7 @@ HEADERS = [
 files."""
 
 POLICY_VIOLATION = 1008
-"""Close code of a websocket that is refused."""
+"""Close code of a rejected websocket."""
 
 MAX_MESSAGE_BYTES = 1_000_000
 """Size limit of websocket messages and of requests other than uploads, as in
@@ -315,7 +315,7 @@ class Bounds:
     def _refusal(
         self, scope: Scope, is_upload: bool, most: int
     ) -> tuple[int, str] | None:
-        """Return status and reason if the request is refused by its head; else None."""
+        """Return status and reason if the head of a request is rejected, else None."""
         method, path = scope["method"], scope["path"]
         if method not in ALL_METHODS:
             return 405, f"{method:.20}: expected GET, HEAD or POST"

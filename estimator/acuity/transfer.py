@@ -1,8 +1,8 @@
 """Optical transfer functions, and the contrast sensitivity of the visual system.
 
-A transfer function is the autocorrelation of the pupil function, by FFT.  The contrast
-sensitivity of the Standard Spatial Observer, measured with natural optics, divided by
-the modulation transfer of the mean eye is the neural contrast sensitivity.
+A transfer function is the autocorrelation of the pupil function, computed by FFT.  The
+neural contrast sensitivity is that of the Standard Spatial Observer, which was measured
+through natural optics, divided by the modulation transfer of the mean eye.
 """
 
 import math
@@ -252,8 +252,8 @@ def _samples(
 ) -> int:
     """Return the number of samples across the circle for the slope at its rim.
 
-    The additional samples for a screen are capped at `MAX_SAMPLES`: only light that
-    orders of high power deflect at the rim is then aliased, and there is little of it.
+    The additional samples for a screen are capped at `MAX_SAMPLES`.  This aliases only
+    the small share of the light that orders of high power deflect at the rim.
     """
     angles = 2.0 * np.pi * np.arange(72) / 72
     slopes = zernike_gradient(  # per radius

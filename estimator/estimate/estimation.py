@@ -307,7 +307,8 @@ def estimate_eye(
     Raises
     ------
     ValueError
-        The method or a start is unknown, or the profile gives the eye by its surfaces.
+        The method or a start is unknown, or the profile defines the eye by its
+        surfaces.
     WeightsMissing, DamagedWeights
         The weights of ``network`` are missing or damaged.
     """
@@ -317,8 +318,8 @@ def estimate_eye(
         raise ValueError(f"starts {starts}: allowed are {', '.join(STARTS)}")
     if profile.surfaces is not None:
         raise ValueError(
-            f"profile kind '{profile.kind}' gives the eye by its surfaces, not by the "
-            "parameters of the eye model: allowed are the other kinds"
+            f"profile kind '{profile.kind}' defines the eye by its surfaces, not by "
+            "the parameters of the eye model: allowed are the other kinds"
         )
     if profile.higher_order != "none":
         found = estimate_eye(

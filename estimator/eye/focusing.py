@@ -176,7 +176,7 @@ class FocusedSurfaces:
 
 
 class FocusingEye(Focusing):
-    """A `Focusing` eye whose wavefronts are known up to some pupil.
+    """A `Focusing` eye whose wavefronts are known up to a maximum pupil diameter.
 
     Attributes
     ----------

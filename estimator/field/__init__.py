@@ -8,9 +8,10 @@ traced_fields           traced part of the field; wavefronts at fixed fields, as
                         and accommodation change
 traced_eye              an estimated eye, ray-traced over the field
 prepare                 entry point: from a profile to such an eye, with notes
-network_eye             the same by network: the eye of the published pipeline
-field_table             wavefronts in many directions, at the cornea; of drawn persons;
-                        maps of them
+network_eye             entry point of the published pipeline, whose eyes are estimated
+                        by networks
+field_table             wavefronts at the cornea in many directions, also of randomly
+                        sampled people, and their maps
 
 A *field* is a direction in the visual field, azimuth h and elevation v.  A *grid* has
 axes of h, v, pupil, accommodation and wavelength.  The *state* of an eye is its pupil

@@ -168,7 +168,7 @@ def _check_profile(profile: EyeProfile) -> None:
     NetworkUnfit
     """
     if profile.surfaces is not None:
-        problem = f"kind '{profile.kind}' gives the eye by its surfaces"
+        problem = f"kind '{profile.kind}' defines the eye by its surfaces"
     elif profile.correction is not None:
         problem = "a correction, such as spectacles or an intraocular lens"
     elif profile.retina is not None:
@@ -365,7 +365,7 @@ def _notes(
         expected = load_network("eye").card.error
         eye = Note(
             "eye_by_network",
-            f"eye by network in {found.time_ms:.0f} ms, mean error "
+            f"eye estimated by the network in {found.time_ms:.0f} ms, mean error "
             f"{found.mean_abs_error_um:.1e} um over 25 terms; expected {expected}",
             time_ms=found.time_ms,
             mean_error_um=found.mean_abs_error_um,
@@ -373,7 +373,7 @@ def _notes(
         )
     aberrations = _error_note(grid, states)
     lacking = {
-        "the rest of the measurement": found.method == "network",
+        "the residual of the measurement": found.method == "network",
         "measurements off the axis": len(profile.measurements) > 1,
         "the periphery of measured eyes": (
             grid.h_deg.size > 1 and profile.periphery == "people"

@@ -1,8 +1,8 @@
-"""Preparation of the eye of a profile for PSFs: measured wavefront or traced model.
+"""Prepare the eye of a profile for PSFs, as a measured wavefront or a traced model.
 
-Over the field, one wavelength is traced at all nodes.  The difference of the others is
-smaller and smoother than the change over the field: it is traced at fewer fields and
-accommodations, and interpolated.
+One wavelength is traced at every node of the field.  The differences between it and the
+other wavelengths are smaller and smoother than the change over the field, so they are
+traced at fewer fields and accommodations and interpolated.
 """
 
 from __future__ import annotations
@@ -40,9 +40,9 @@ from estimator.profiles.parse import EyeProfile
 from estimator.wavefront.field_wavefronts import ellipse_from_rim, rim_from_ellipse
 
 FIELD_RATIO = 0.7
-"""Ratio of the field nodes of other wavelengths to the first one's, along each axis:
-7 x 6 for 10 x 8.  The RMS error at random fields (emmetropia, 5 mm) is then 0.98e-3 um
-instead of 0.95e-3; with 6 x 5, it is 1.2e-3."""
+"""Number of field nodes of the other wavelengths per node of the first one, along each
+axis: 7 x 6 for 10 x 8.  The RMS error at random fields (emmetropia, 5 mm) is then
+0.98e-3 um instead of 0.95e-3; with 6 x 5, it is 1.2e-3."""
 
 FEW_ACCOMMODATIONS = 3
 """Largest number of accommodations of other wavelengths; with two, the RMS error is
@@ -248,7 +248,7 @@ def _of_eye(estimated: EyeModel) -> str:
         f"in {estimated.time_ms:.0f} ms, mean error "
         f"{estimated.mean_abs_error_um:.1e} um over 25 terms"
     )
-    start = ", refined from a table's eye" if estimated.start == "table" else ""
+    start = ", refined from an eye in a table" if estimated.start == "table" else ""
     return Note(
         "eye_estimated",
         f"eye estimated {poor}{found}{start}",
@@ -288,9 +288,9 @@ def prepare_eye(
     field_range_deg : ((h_low, h_high), (v_low, v_high))
         Azimuths and elevations.
     nodes_deg : (n_h,), (n_v,), optional
-        Azimuths and elevations of the range, ends included, whose wavefronts are exact;
-        others are not interpolated well.  By default, all are interpolated between
-        nodes of its own.
+        Azimuths and elevations of the range, ends included, at which wavefronts are
+        exact; between them, interpolation is poor.  By default, the function chooses
+        nodes between which all directions are interpolated well.
     eye_model : {"traced", "wavefront"}
         "traced" estimates a 45-parameter eye and traces its wavefronts.  "wavefront"
         uses the measurement in closed form, at no cost, but does not model pupils

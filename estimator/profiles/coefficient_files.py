@@ -2,9 +2,8 @@
 
 A ``.csv`` file has a row for each term, or one row with a column for each term.
 Settings, such as the pupil, are in separate lines, in columns or in comments:
-``# frame: examiner``.  A setting without its unit, or in another one, is refused, and
-so is a comment or a column that looks like a setting; other entries are named in a
-note.
+``# frame: examiner``.  It is an error if a setting lacks its unit or has another one,
+or if a comment or a column resembles a setting.  A note names other entries.
 """
 
 import csv
@@ -37,7 +36,7 @@ MATTERING = {
     *("correction", "sphere", "cylinder", "vertex", "retina", "periphery"),
     *("sample", "straylight", "yellowing"),
 }
-"""Words of settings: a comment with one of them as its key is refused."""
+"""Words of settings: it is an error if a comment has one of them as its key."""
 
 CONVENTIONS = {"convention", "conventions", "standard", "normalization", "ordering"}
 """Words of keys whose value has to name the terms of OSA/ANSI."""

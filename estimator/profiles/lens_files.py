@@ -1,8 +1,8 @@
 """Eyes in lens files of other programs, as bodies of kind ``surfaces``.
 
 `zemax_files` and `optiland_body` read a file to a list of `Element`, as far as eyes use
-the format; JSON files of optiland from version 0.2.4 on.  Whatever else would change a
-ray is refused by its name.
+the format; JSON files of optiland from version 0.2.4 on.  An error names
+anything else in the file that would change a ray.
 """
 
 import math

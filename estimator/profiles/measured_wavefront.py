@@ -122,7 +122,7 @@ class MeasuredWavefront(FocusingEye):
         self.vergence = ObjectVergence.seen_through(
             profile.correction, entrance_pupil_mm=depth_mm
         )
-        # of the last pupil: each frame requests its refraction five times
+        # Cached for the last pupil, because each frame requests it five times.
         self._relaxed: tuple[float, float] | None = None
         self.eye_side = profile.eye_side
         self.zernike_um = zernike_um
@@ -161,7 +161,7 @@ class MeasuredWavefront(FocusingEye):
     def accommodation_for_dpt(
         self, refraction_dpt: float, *, pupil_diameter_mm: float
     ) -> float:
-        """Return the accommodation in reach whose M at a pupil is nearest to this."""
+        """Return the available accommodation whose M is closest to a refraction."""
         relaxed_dpt = self.refraction_at_dpt(pupil_diameter_mm=pupil_diameter_mm)
         return min(max(relaxed_dpt - refraction_dpt, 0.0), self.amplitude_dpt)
 
@@ -170,7 +170,7 @@ class MeasuredWavefront(FocusingEye):
         return self.amplitude_dpt
 
     def chromatic_shift_dpt(self, wavelength_nm: float) -> float:
-        """Return the refraction at this wavelength minus the measured one's, dpt."""
+        """Return the refraction relative to the measured wavelength, in dpt."""
         return float(
             chromatic_refraction_dpt(wavelength_nm)
             - chromatic_refraction_dpt(self.wavelength_nm)
@@ -190,7 +190,7 @@ class MeasuredWavefront(FocusingEye):
             self.zernike_um, radius_ratio=radius_mm / self.zernike_radius_mm
         )
         zernike_um[rx.C20] -= added_defocus_dpt * radius_mm**2 / SPHERE_PER_C20
-        zernike_um[0] = 0.0  # rescaling adds piston, which no image shows
+        zernike_um[0] = 0.0  # rescaling adds piston, which no image depends on
         return zernike_um
 
     # ----- interface to the PSF cache (also in estimator/field/traced_eye.py)
@@ -213,7 +213,7 @@ class MeasuredWavefront(FocusingEye):
         accommodation_dpt: ArrayLike,
         wavelength_nm: ArrayLike,
     ) -> NDArray[np.float64]:
-        """Return least-squares refraction, dpt, on the pupil itself; far object.
+        """Return the least-squares refraction over the pupil, in dpt.
 
         All arguments broadcast, and the result has their shape.  The object is at
         infinity.
@@ -256,7 +256,7 @@ class MeasuredWavefront(FocusingEye):
         accommodation_dpt: ArrayLike,
         wavelength_nm: ArrayLike,
     ) -> NDArray[np.float64]:
-        """Return zero lateral color (..., 2), mrad: one wavelength does not give it."""
+        """Return zeros (..., 2), in mrad: one wavelength has no lateral color."""
         states = np.broadcast_shapes(
             *map(np.shape, (h_deg, v_deg, accommodation_dpt, wavelength_nm))
         )
@@ -336,7 +336,7 @@ class MeasuredWavefront(FocusingEye):
         """
         values = (pupil_diameter_mm, object_dpt, focus_dpt, wavelength_nm)
         if not all(math.isfinite(v) for v in values) or pupil_diameter_mm <= 0:
-            raise ValueError(f"eye state {values}: needs a positive pupil, all finite")
+            raise ValueError(f"eye state {values}: allowed: finite, positive pupil")
         usable_mm = self.usable_pupil_mm(pupil_diameter_mm)
         added_dpt = (
             self.vergence.vergence_dpt(object_dpt)

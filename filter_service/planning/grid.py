@@ -1,11 +1,15 @@
 """Specification of a PSF cache, and placement of its nodes, layers and directions.
 
+`GridSpec` states what the PSFs of an eye must cover: a camera, settings and limits.
+The planner derives the nodes from it, the PSF store computes and caches the PSFs of
+these nodes, and the engines select PSFs for a frame by it.
+
 The cache spans pupil and *total defocus* (refraction + object vergence -
-accommodation + chromatic shift).  Object distance, focus and wavelength act on an
-on-axis PSF through that sum alone, so a node serves every combination with the same
-sum.  Frame layers follow the paper in never being more than a step of blur apart
-(section 6.2, Eq. 8); where the blur is constant, they are farther apart than the
-paper's uniform distances.
+accommodation + chromatic shift).  Object distance, focus and wavelength affect an
+on-axis PSF only through that sum, so a node serves every combination with the same
+sum.  As in the paper (section 6.2, Eq. 8), layers of a frame are at most one step of
+blur apart; where the blur is constant, they are farther apart than the uniform
+distances of the paper.
 
 The camera is a pinhole in the eye's entrance pupil, and gaze rotates the eye relative
 to it.  Field directions (h, v) are relative to the eye (CONVENTIONS.md), so the PSFs of
@@ -179,7 +183,8 @@ FOCUS_SAMPLES = 65
 """Number of positions between two foci at which the step is evaluated."""
 
 LAYER_BLUR_RATIO = {"on-axis": 0.05, "quality": 0.05, "dynamic": 0.1}
-"""Blur step between layers, of the blur radius; at least `MIN_BLUR_STEP_PX`."""
+"""Blur step between layers relative to the blur radius, by mode; the step is at least
+`MIN_BLUR_STEP_PX`."""
 
 LAYER_GAP_STEPS = 2.0
 """Largest defocus between layers, in blur steps of a perfect eye; at least
@@ -187,7 +192,7 @@ LAYER_GAP_STEPS = 2.0
 1280x720; with these values, 32 and the same error."""
 
 PAPER_REACH_DEG = {"quality": (45.0, 25.0), "dynamic": (45.0, 24.0)}
-"""Azimuth and elevation to both sides (released code of the paper)."""
+"""Azimuth and elevation of the field to either side, in the paper's released code."""
 
 
 @dataclass(frozen=True)
@@ -201,11 +206,11 @@ class GridSpec:
     settings : FilterSettings
         Pupils, distances, field and tolerance.
     memory_budget_mb : float
-        Limit of memory; a larger plan is refused.
+        Maximum memory of a plan.
     max_blur_step_px : float
         Blur difference between neighboring nodes.
     max_blur_radius_px : int
-        Largest blur, where diffraction tails end; more is refused.
+        Maximum blur radius, at which diffraction tails are cut off.
     kept_energy_ratio : float
         Share of light within a kernel's box; kernels are normalized to unit sum
         afterward.  With 0.99, filtered images have a PSNR of 60 dB or more against
@@ -215,7 +220,7 @@ class GridSpec:
     Raises
     ------
     BadMessage
-        If pixels are too small or too large, or a gaze turns the image beyond all PSFs.
+        If pixels are too small or too large, or the range of gaze exceeds the field.
     """
 
     camera: Camera
@@ -226,7 +231,7 @@ class GridSpec:
     kept_energy_ratio: float = 0.99
 
     def __post_init__(self) -> None:
-        """Refuse cameras and gazes for which no cache can be built."""
+        """Raise if no cache can be built for the camera or the gaze."""
         for pitch_mrad in self.pixel_pitch_mrad:
             if not 0.005 <= pitch_mrad <= 100.0:
                 raise BadMessage(
@@ -237,7 +242,7 @@ class GridSpec:
         self._check_gaze()
 
     def _check_gaze(self) -> None:
-        """Refuse a gaze that turns the image beyond all PSFs."""
+        """Raise if the range of gaze exceeds the field that PSFs can cover."""
         if not (self.follows_field and any(self.settings.gaze_range_deg)):
             return
         seen_deg = field_range_deg(self.camera, gaze_deg=self.settings.gaze_deg)
@@ -293,8 +298,8 @@ class GridSpec:
     def blends_at_equal_blur(self) -> bool:
         """Return whether field nodes are blended at equal defocus, not equal distance.
 
-        Planned nodes cover the defocus that their neighbors read; each of the paper's
-        nodes has nine object distances of its own.
+        Planned nodes cover the defocus at which their neighbors are blended.  In the
+        paper's grid, each node has its own nine object distances.
         """
         return self.settings.grid == "planned"
 
@@ -387,9 +392,9 @@ class GridSpec:
     ) -> NDArray[np.float64]:
         """Return the pixel scale (..., 2, 2) of the stored kernels of a field node.
 
-        It is the scale of the image where the node appears.  A node that the gaze moves
-        over the image has the pixels of the axis, reduced to the smallest pixels in the
-        image, so that frames average stored pixels and never enlarge them.
+        It is the scale of the image at the node's position.  If the gaze moves nodes
+        over the image, it is the scale on the axis, reduced to the smallest pixel at
+        these positions, so that frames average stored pixels and never enlarge them.
         """
         if not any(self.settings.gaze_range_deg) or not self.follows_field:
             return self.pixel_from_mrad(h_deg, v_deg)

@@ -106,9 +106,9 @@ class ServiceConfig:
     max_width_px, max_height_px, max_views, max_part_mb, max_profile_kb : int
         Limits of one message; published in ``welcome``.
     max_blur_radius_px : int
-        Largest kernel radius; a profile that needs a wider kernel is refused.
+        Largest kernel radius; a profile that needs a wider kernel is rejected.
     max_store_mb : int
-        Memory for the PSFs of one profile; a profile that needs more is refused.
+        Memory for the PSFs of one profile; a profile that needs more is rejected.
     max_stores_mb : int
         Memory for the PSFs of all clients, on each device.  Beyond it, the least
         recently used PSFs are evicted and computed again when a frame needs them.

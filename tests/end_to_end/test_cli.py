@@ -389,7 +389,7 @@ def test_a_traced_eye_says_how_it_was_found(scene):
     folder, _ = scene
     traced = filter_arguments(folder, "--eye-model", "traced", "--mode", "on-axis")
     notes = run_json(*traced)["notes"]
-    assert "refined from a table's eye" in notes[0]
+    assert "refined from an eye in a table" in notes[0]
     assert not any("network" in note or "accuracy" in note for note in notes)
 
 

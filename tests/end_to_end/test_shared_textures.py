@@ -340,7 +340,7 @@ def test_wrong_memory_is_refused(service, client, gl, caplog, make, size_bytes, 
     os.close(descriptor)
     assert found is None
     (line,) = [entry.getMessage() for entry in caplog.records]
-    assert line.startswith("no shared textures, send images instead")
+    assert line.startswith("cannot share textures; sending images instead")
     assert reason in line
     assert is_usable(gl, client)
     wait_until(lambda: has_few_maps(service, before))

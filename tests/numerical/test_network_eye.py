@@ -96,7 +96,7 @@ def test_the_rest_of_the_measurement_is_not_added(keratoconus):
     assert eye._residual.rms_um == 0.0
     assert found.rest([REFERENCE_WAVELENGTH_NM]).rms_um > 0.0
     (told,) = [note for note in notes if note.code == "published_not_modeled"]
-    assert "the rest of the measurement" in told
+    assert "the residual of the measurement" in told
     assert "the periphery of measured eyes" in told
 
 
@@ -167,7 +167,7 @@ NOT_MODELED = {
         "sphere_dpt": -3,
         "correction": {"sphere_dpt": -3, "vertex_mm": 12},
     },
-    "kind 'published' gives the eye by its surfaces": {
+    "kind 'published' defines the eye by its surfaces": {
         "kind": "published",
         "name": "arizona",
     },
