@@ -7,6 +7,7 @@ import os
 import shlex
 import shutil
 import sys
+from glob import glob
 
 from setuptools import build_meta
 from setuptools.build_meta import *  # noqa: F403  (the other hooks)
@@ -34,3 +35,10 @@ def get_requires_for_build_editable(config_settings=None):
     """Return what an editable installation requires."""
     own = build_meta.get_requires_for_build_editable(config_settings)
     return [*own, *compiler_requirements()]
+
+
+def build_wheel(wheel_directory, config_settings=None, metadata_directory=None):
+    """Build a wheel, without modules that an earlier build left in ``build``."""
+    for folder in glob("build/lib*"):
+        shutil.rmtree(folder)
+    return build_meta.build_wheel(wheel_directory, config_settings, metadata_directory)

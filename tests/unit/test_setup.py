@@ -48,6 +48,19 @@ def test_without_a_compiler_the_build_asks_for_that_of_pypi(monkeypatch):
     assert backend.ZIG in backend.get_requires_for_build_editable()
 
 
+def test_a_wheel_has_no_modules_of_an_earlier_build(monkeypatch, tmp_path):
+    monkeypatch.syspath_prepend(ROOT)
+    backend = importlib.import_module("build_backend")
+    stale = tmp_path / "build/lib.linux-x86_64-cpython-311/estimator/media/__init__.py"
+    stale.parent.mkdir(parents=True)
+    stale.write_text("")
+    (tmp_path / "build/temp").mkdir()
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(backend.build_meta, "build_wheel", lambda *given: given)
+    assert backend.build_wheel("dist") == ("dist", None, None)
+    assert [path.name for path in (tmp_path / "build").iterdir()] == ["temp"]
+
+
 @pytest.mark.parametrize("name", ["constraints.txt", "setup.sh", "Makefile", ".ci/run"])
 def test_set_up_names_no_host(name):
     assert "://" not in (ROOT / name).read_text(encoding="utf-8")
