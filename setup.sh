@@ -294,7 +294,7 @@ install_release() { # tools that build and check releases
 }
 
 install_examples() { # the package as users install it, without the checkout
-    wanted=$(pwd; cksum setup.sh setup.py pyproject.toml constraints.txt
+    wanted=$(pwd; cksum setup.sh setup.py build_backend.py pyproject.toml constraints.txt
         find estimator filter_service clients ocufilter shaders -type f ! -name '*.so' \
             ! -path '*/__pycache__/*' ! -path '*/node_modules/*' -exec cksum {} +)
     wanted=$(echo "$wanted" | sort | cksum)
