@@ -3,14 +3,8 @@
 import re
 import tomllib
 
-from filter_service import (
-    Camera,
-)
 from filter_service.messages import PROTOCOL_VERSION
 from tests.source_tree import PACKAGES, ROOT, python_files
-
-CAMERA = Camera(32, 16, (-0.1, 0.1, 0.05, -0.05))
-PROFILE = {"kind": "prescription", "sphere_dpt": -1.0}
 
 
 def _version(text: str) -> tuple[int, ...]:
