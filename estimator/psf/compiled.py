@@ -17,7 +17,8 @@ from estimator.native.records import (
     PsfJob,
     pointer_to,
 )
-from estimator.psf.tables import psf_tables
+from estimator.psf.fourier import ACCURACY, FourierAccuracy
+from estimator.psf.tables import GEOMETRIC_FROM_DB, psf_tables
 
 SIDES = 4
 
@@ -74,6 +75,8 @@ class CompiledPsfs:
         channels: NDArray[np.int64],
         *,
         ring_tables: NDArray[np.float32] | None = None,
+        rays_from_db: float = GEOMETRIC_FROM_DB,
+        accuracy: FourierAccuracy = ACCURACY["normal"],
         **numbers: Any,
     ) -> ComputedKernels:
         """Compute the kernels of PSFs (n,).
@@ -85,6 +88,9 @@ class CompiledPsfs:
         nodes, groups, channels : (n,)
             Wavefront, pixel scale and color of each PSF.
         ring_tables : (3, n_primaries, n_rings, 2), optional
+        rays_from_db : float
+            Predicted PSNR from which ray optics is used.
+        accuracy : FourierAccuracy
         **numbers
             Other fields of the record.
 
@@ -106,11 +112,18 @@ class CompiledPsfs:
         radius_px, sizes = np.zeros((2, count), np.int64)
         peak, spread, lost, rays = np.zeros((4, count))
         outcome = np.empty(count, np.int32)
-        tables, _ = psf_tables(kept["zernike_um"].shape[-1])
+        tables, _ = psf_tables(
+            kept["zernike_um"].shape[-1],
+            filter_half_width=accuracy.filter_half_width,
+            rays_from_db=rays_from_db,
+        )
         job = PsfJob(
             threads=self.threads,
             tables=ctypes.addressof(tables),
             **{name: pointer_to(array) for name, array in kept.items()},
+            oversampling=accuracy.oversampling,
+            margin=accuracy.margin,
+            min_samples_per_px=accuracy.min_samples_per_px,
             **numbers,
             reach_px=pointer_to(reach_px),
             radius_px=pointer_to(radius_px),

@@ -306,6 +306,7 @@ def psf_tables(
     n_terms: int = N_TERMS,
     filter_half_width: int = 4,
     filter_count: int = FILTER_COUNT,
+    rays_from_db: float = GEOMETRIC_FROM_DB,
 ) -> tuple[PsfTables, dict[str, NDArray[np.generic]]]:
     """Return the tables of the engine, and the arrays that they point to.
 
@@ -317,6 +318,8 @@ def psf_tables(
         Extent of the pixel filters beyond the pixel, samples.
     filter_count : int
         Largest number of samples per pixel.
+    rays_from_db : float
+        Predicted PSNR from which ray optics is used.
     """
     arrays = _common_tables(filter_half_width, filter_count) | {
         name: np.ascontiguousarray(array)
@@ -332,7 +335,7 @@ def psf_tables(
         per_rms_db=PER_RMS_DB,
         per_pixel_db=PER_PIXEL_DB,
         per_narrow_db=PER_NARROW_DB,
-        rays_from_db=GEOMETRIC_FROM_DB,
+        rays_from_db=rays_from_db,
         fade_db=CROSS_FADE_DB,
         min_cells=MIN_CELLS,
         max_cells=MAX_CELLS,

@@ -215,6 +215,25 @@ def defocus_nodes(
     return DefocusNodes(nodes, shift_dpt, is_limited, shrink_ratio)
 
 
+def limited_defocus(
+    eye: EyeOptics,
+    spec: GridSpec,
+    groups: PupilStates,
+    group_rays: GroupRays,
+    ranges_dpt: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Clip ranges (P, 2) of total defocus to those with small enough kernels.
+
+    Returns
+    -------
+    limited_dpt : (P, 2)
+    shrink_ratio : (P,)
+        Ratio that shrinks the smallest kernel of a range to the limit; one if it fits.
+    """
+    rays = _Rays.of(eye, spec, groups, group_rays, allowed_error=1.0)
+    return rays.limited(ranges_dpt, spec, groups)
+
+
 @dataclass(frozen=True)
 class _Rays:
     """Landing points of the rays of each group (P,), in px and linear in defocus.

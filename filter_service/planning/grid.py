@@ -26,6 +26,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from estimator.optics import pinhole
 from estimator.optics.units import REFERENCE_WAVELENGTH_NM
+from estimator.psf.tables import GEOMETRIC_FROM_DB
 from filter_service.camera import Camera, is_same_camera
 from filter_service.displays import display_wavelengths_nm, display_widths_nm
 from filter_service.errors import BadMessage
@@ -216,6 +217,11 @@ class GridSpec:
         afterward.  With 0.99, filtered images have a PSNR of 60 dB or more against
         uncropped kernels, with 0.995 65 dB, with 0.998 67 dB (240 kernels over the
         field, 2.5 to 6 mm).
+    rays_from_db : float
+        Predicted PSNR from which PSFs are computed by ray optics.
+    is_exact : bool
+        Whether the PSFs are those of a single state, for frames with a render tolerance
+        of 0; see `psfs.exact_store`.
 
     Raises
     ------
@@ -229,6 +235,8 @@ class GridSpec:
     max_blur_step_px: float = 0.5
     max_blur_radius_px: int = 255
     kept_energy_ratio: float = 0.99
+    rays_from_db: float = GEOMETRIC_FROM_DB
+    is_exact: bool = False
 
     def __post_init__(self) -> None:
         """Raise if no cache can be built for the camera or the gaze."""

@@ -115,6 +115,8 @@ def computed_kernels(
         diffraction=spec.settings.diffraction,
         stiles_crawford=apodization(eye, spec),
         rings=rings,
+        rays_from_db=spec.rays_from_db,
+        is_fine=spec.is_exact and spec.settings.mode != "dynamic",
     )
     if left.size:
         others, more = generic(groups[left], channels[left], total_dpt[left])

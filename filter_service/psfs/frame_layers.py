@@ -163,7 +163,7 @@ def frame_layers(
         layer_zero_dpt=layer_zero_dpt,
         reads=reads,
         tables=store.tables,
-        edge_reach_px=_edge_reach_px(store.spec, pupil_mm),
+        edge_reach_px=edge_reach_px(store.spec, pupil_mm),
         state=State(pupil_mm, float(reached_dpt)),
         blur_px_per_dpt=store.spec.blur_px_per_dpt(pupil_mm),
         notes=notes,
@@ -272,7 +272,7 @@ def _layer_distances_dpt(
     return found_dpt[:count]
 
 
-def _edge_reach_px(spec: GridSpec, pupil_mm: float) -> float:
+def edge_reach_px(spec: GridSpec, pupil_mm: float) -> float:
     """Return the distance from the rays beyond which kernels may drop the light.
 
     A circular pupil of diameter D sends 2 lambda / (pi² D r) of its light farther than

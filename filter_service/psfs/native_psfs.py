@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 
 from estimator.corrections.rings import Rings
 from estimator.psf.compiled import CompiledPsfs, compiled_psfs
-from estimator.psf.compute import ACCURACY
+from estimator.psf.fourier import ACCURACY
 from estimator.psf.screens import BEYOND_EDGE, ONE_CENTER, TABLE_COUNT
 from estimator.psf.stiles_crawford import StilesCrawford
+from estimator.psf.tables import GEOMETRIC_FROM_DB
 from filter_service.constants import RGB
 from filter_service.planning.node_wavefronts import NodeWavefronts
 from filter_service.psfs.pack import CUT_STEPS, MAX_CENTROID_SHIFT_RATIO, PackedKernels
@@ -99,6 +100,8 @@ class NativePsfs:
         diffraction: bool = True,
         stiles_crawford: StilesCrawford | None = None,
         rings: NodeRings | None = None,
+        rays_from_db: float = GEOMETRIC_FROM_DB,
+        is_fine: bool = False,
     ) -> tuple[PackedKernels, Counter[str], NDArray[np.int64]]:
         """Compute the kernels of PSFs (n,).
 
@@ -115,6 +118,10 @@ class NativePsfs:
         diffraction : bool
         stiles_crawford : StilesCrawford, optional
         rings : NodeRings, optional
+        rays_from_db : float
+            See `GridSpec`.
+        is_fine : bool
+            Whether wave optics has the accuracy "fine" of `compute_psf_batch`.
 
         Returns
         -------
@@ -126,7 +133,6 @@ class NativePsfs:
             Indices of the PSFs among the n that `estimator.psf` must compute or refuse.
         """
         primaries = wavefronts.wavelength_nm.shape[1]
-        sampling = ACCURACY["normal"]
         arrays = {
             "zernike_um": wavefronts.zernike_um,
             "per_dpt_um": wavefronts.per_dpt_um,
@@ -149,6 +155,8 @@ class NativePsfs:
             groups * RGB + channels,
             groups,
             channels,
+            rays_from_db=rays_from_db,
+            accuracy=ACCURACY["fine" if is_fine else "normal"],
             ring_tables=None if rings is None else rings.amplitude_ratio,
             apodization_center_mm=center_mm,
             ring_steps_per_mm2=TABLE_COUNT / rings.radius_mm**2 if rings else 0.0,
@@ -157,9 +165,6 @@ class NativePsfs:
             cut_ratio=CORNERS_TWICE * (1.0 - kept_energy_ratio),
             centroid_ratio=MAX_CENTROID_SHIFT_RATIO,
             cut_steps=CUT_STEPS,
-            oversampling=sampling.oversampling,
-            margin=sampling.margin,
-            min_samples_per_px=sampling.min_samples_per_px,
             primaries=primaries,
             max_radius_px=max_radius_px,
             is_diffracting=diffraction,

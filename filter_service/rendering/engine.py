@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from estimator.note import Note
 from filter_service.errors import BadMessage, CameraMismatch
 from filter_service.planning.grid import GridSpec
+from filter_service.rendering.frame import object_range_dpt
 from filter_service.rendering.frame_kernels import MissingPsfs
 from filter_service.rendering.frame_states import FrameStore
 from filter_service.rgbd_view import RgbdView
@@ -32,6 +33,9 @@ OUTPUT_DTYPES = {"linear": np.float32, "srgb8": np.uint8, "linear16": np.float16
 
 SAMPLE_STRIDE_PX = 16
 """Stride of the check of the depth unit, which takes 25 us."""
+
+RANGE_STEP_DPT = 0.5
+"""Steps of the range of object distances that the PSFs of a single state are for."""
 
 FAR_SCENE_M = 100.0
 """If all depth exceeds this, the unit is probably centimeters or millimeters: scenes
@@ -215,6 +219,32 @@ class FrameEngine(Protocol):
         RenderError
             In particular, the engine does not filter textures.
         """
+
+
+def with_exact_psfs(engine: FrameEngine, request: ViewRequest) -> ViewRequest:
+    """Return a request with the PSFs of its state if its render tolerance is 0.
+
+    Textures whose caller does not wait keep the PSFs of the store: computing those of a
+    state takes seconds.
+    """
+    spec = request.handle.store.spec
+    is_exact = request.options.render_tolerance == 0.0 and spec.settings.grid != "paper"
+    if not is_exact or spec.is_exact or request.options.accumulation == "paper":
+        return request
+    if isinstance(request.view, TextureView) and not request.waits:
+        return request
+    gaze_deg, _ = clamped_gaze(spec, request.state.gaze_deg)
+    state = replace(request.state, gaze_deg=gaze_deg)
+    with request.times.wall("psf_plan_ms"):
+        range_dpt = spec.object_range_dpt
+        if isinstance(request.view, RgbdView):
+            # In whole steps, so that frames of a stream use the same PSFs.
+            whole = RANGE_STEP_DPT * np.array([-1.0, 1.0])
+            outer = whole * np.ceil(np.array(object_range_dpt(request.view)) / whole)
+            low, high = np.clip(outer, *range_dpt).tolist()
+            range_dpt = low, high
+        handle = request.handle.exact(state, range_dpt, engine.load)
+    return replace(request, handle=handle)
 
 
 class OneView:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import cached_property
@@ -18,6 +19,7 @@ from estimator.psf.tables import N_EDGE
 from filter_service.constants import RGB
 from filter_service.errors import OutOfMemory
 from filter_service.planning.node_wavefronts import apodization
+from filter_service.psfs.exact_store import ExactStore
 from filter_service.psfs.field_defocus import FieldAxes
 from filter_service.psfs.frame_layers import FrameLayers, frame_layers
 from filter_service.psfs.store import PsfStore
@@ -158,6 +160,9 @@ def layer_step_ratio(tolerance: float) -> float:
     return min(max(math.sqrt(tolerance), LAYER_STEP_RATIOS[0]), LAYER_STEP_RATIOS[1])
 
 
+KEPT_EXACT = 2
+"""Number of stores of single states that are kept."""
+
 CornerWeights = tuple[NDArray[np.float64], NDArray[np.float64]]
 """Weights of the defocus spline along h and v at the corners of cells."""
 
@@ -192,6 +197,8 @@ class FrameStore:
         self._image: tuple[tuple[Any, ...], ImageCells] | None = None
         self._change: tuple[FrameLayers, ImageCells, NDArray[Any]] | None = None
         self._corner_weights: tuple[FieldAxes, ImageCells, CornerWeights] | None = None
+        self._exact: dict[tuple[Any, ...], FrameStore] = {}
+        self._fewer_parts = 0  # of exact stores, which did not fit in memory
 
     @cached_property
     def node_scale(self) -> NDArray[np.float64]:
@@ -211,7 +218,11 @@ class FrameStore:
     @property
     def memory_mb(self) -> float:
         """Memory of the computed kernels, MB."""
-        return self.store.memory_mb
+        return self.store.memory_mb + self._exact_mb
+
+    @property
+    def _exact_mb(self) -> float:
+        return sum(handle.memory_mb for handle in self._exact.values())
 
     def missing_psfs(
         self,
@@ -253,12 +264,66 @@ class FrameStore:
         """Add a part of the plan that the worker has prepared."""
         self.store.take(part)
 
+    def exact(
+        self,
+        state: State,
+        object_range_dpt: tuple[float, float],
+        load: Callable[[PsfStore], FrameStore],
+    ) -> FrameStore:
+        """Return a store with the PSFs of one state, loaded by a function.
+
+        The last `KEPT_EXACT` are kept: a frame with a deadline continues where an
+        earlier attempt stopped, even if another stream uses the eye in between.
+
+        Parameters
+        ----------
+        state : State
+            Pupil, focus and gaze; the gaze is within the prepared range.
+        object_range_dpt : (low, high)
+            Object distances that the PSFs are for.
+        load : callable
+            `FrameEngine.load`.
+        """
+        key = state, object_range_dpt
+        handle = self._exact.pop(key, None)
+        if handle is None:
+            while len(self._exact) >= KEPT_EXACT:
+                self._exact.pop(next(iter(self._exact))).release()
+            handle = load(
+                ExactStore(
+                    self.store, state, object_range_dpt, fewer_parts=self._fewer_parts
+                )
+            )
+        self._exact[key] = handle
+        return handle
+
+    def coarsen_exact(self) -> bool:
+        """Reduce the field nodes of `exact`, whose PSFs do not fit in memory.
+
+        Returns whether that was possible.
+        """
+        if not any(
+            isinstance(handle.store, ExactStore) and handle.store.field_parts > 1
+            for handle in self._exact.values()
+        ):
+            return False
+        self._fewer_parts += 1
+        self._release_exact()
+        return True
+
+    def _release_exact(self) -> None:
+        for handle in self._exact.values():
+            handle.release()
+        self._exact = {}
+
     def release(self) -> None:
         """Free the engine's resources for this store; call it once."""
+        self._release_exact()
         self.is_released = True
 
     def evict(self, max_mb: float) -> None:
         """Evict the least recently used PSFs, see `PsfStore.evict`."""
+        self._release_exact()
         self.store.evict(int(max_mb * 1e6 / self.store.kernels.itemsize))
 
     def _cells_at(self, gaze_deg: tuple[float, float]) -> ImageCells:
@@ -274,6 +339,8 @@ class FrameStore:
         options: RenderOptions = DEFAULT_OPTIONS,
     ) -> FrameLayers:
         """Return the layers for a pupil, a focus and the options of a frame."""
+        if isinstance(self.store, ExactStore):
+            return self.store.layers
         tolerance, spread_px = options.render_tolerance, merge_spread_px(options)
         key = (state.pupil_diameter_mm, state.focus_dpt, tolerance, spread_px)
         if self._layers is None or self._layers[0] != key:

@@ -90,6 +90,9 @@ TEXELS_PER_PIXEL = 10.0
 the cells become twice as wide to save memory.  With 16 bytes per texel, the limit is
 150 MB at 1280x720."""
 
+EXACT_CELL_DEG = {"loose": 0.5, "normal": 0.5, "fine": 0.25}
+EXACT_TEXELS_PER_PIXEL = 80.0
+
 MIN_CELL_PX = 4
 MAX_CELL_PX = 256
 """Cell edges are powers of two, so that each merged square lies within one cell."""
@@ -233,11 +236,11 @@ def check_texels(n_texels: int, image: ImageCells, spec: GridSpec) -> None:
     """
     if not can_coarsen(image):
         return
-    allowed = TEXELS_PER_PIXEL * spec.camera.width_px * spec.camera.height_px
-    if n_texels > allowed:
+    per_pixel = EXACT_TEXELS_PER_PIXEL if spec.is_exact else TEXELS_PER_PIXEL
+    if n_texels > per_pixel * spec.camera.pixel_count:
         raise KernelsTooLarge(
             f"the frame's kernels have {n_texels} texels; expected at most "
-            f"{TEXELS_PER_PIXEL:g} per pixel"
+            f"{per_pixel:g} per pixel"
         )
 
 
@@ -257,5 +260,8 @@ def _node_from_cell(
 def default_cell_px(spec: GridSpec) -> int:
     """Return the edge of cells unless their kernels need too much memory."""
     pixel_deg = math.degrees(min(spec.pixel_pitch_mrad) / 1000.0)
-    power = math.floor(math.log2(max(CELL_DEG[spec.settings.mode] / pixel_deg, 1.0)))
-    return min(max(2**power, MIN_CELL_PX), MAX_CELL_PX)
+    cell_deg, least_px = CELL_DEG[spec.settings.mode], MIN_CELL_PX
+    if spec.is_exact:
+        cell_deg, least_px = EXACT_CELL_DEG[spec.settings.tolerance], 1
+    power = math.floor(math.log2(max(cell_deg / pixel_deg, 1.0)))
+    return min(max(2**power, least_px), MAX_CELL_PX)

@@ -34,7 +34,7 @@ from estimator.threads import thread_count
 from filter_service.camera import Camera
 from filter_service.constants import HALF_MAX, RGB
 from filter_service.displays import display_wavelengths_nm
-from filter_service.errors import BadMessage
+from filter_service.errors import BadMessage, OutOfMemory
 from filter_service.native import loops
 from filter_service.rendering.edge_light import EdgeLight
 from filter_service.rendering.engine import (
@@ -42,6 +42,7 @@ from filter_service.rendering.engine import (
     Pending,
     ViewRequest,
     ViewResult,
+    with_exact_psfs,
 )
 from filter_service.rendering.frame import white_level
 from filter_service.rendering.frame_kernels import MissingPsfs
@@ -361,6 +362,20 @@ def begin_through_media(
     BadMessage
         In addition to its errors: effects need arrays, and the view is in textures.
     """
+    if request.options.render_tolerance > 0.0:
+        return _begin(engine, request, effects)
+    while True:
+        try:
+            found = _begin(engine, request, effects)()
+            return lambda: found
+        except OutOfMemory:
+            if not request.handle.coarsen_exact():
+                raise
+
+
+def _begin(
+    engine: FrameEngine, request: ViewRequest, effects: MediaEffects | None
+) -> Pending:
     view, times = request.view, request.times
     if isinstance(view, TextureView):
         if effects is not None:
@@ -371,6 +386,7 @@ def begin_through_media(
         with times.wall("media_ms"):
             view = seen_through(view, effects.magnification_ratio)
         request = replace(request, view=view)
+    request = with_exact_psfs(engine, request)
     edge_light: EdgeLight | MissingPsfs | None = None
     if view.color.dtype != np.uint8:
         request = replace(request, white_level=white_level(view.color))

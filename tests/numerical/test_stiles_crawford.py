@@ -95,6 +95,8 @@ def own_picture(eye, spec, pupil_mm, effect):
         pixel_pitch_mrad=spec.pixel_pitch_mrad,
         stiles_crawford=effect,
         radius_px=MIDDLE_PX,
+        method="fourier",  # as the PSFs of a frame with a render tolerance of 0
+        accuracy="fine",
     )
     return np.stack([psf.kernel for psf in batch], axis=-1).astype(np.float64)
 

@@ -7,6 +7,9 @@
 #include "constants.h"
 #include "kernel_job.h"
 
+/* Share of a node below which it is not read. */
+#define NODE_SHARE 1e-7
+
 /* Returns the upper node of a total defocus t, and its share; the lower node is the one before,
  * or the same.  The search is linear from `upper`, the node of the previous, smaller t, which
  * mostly is the result.  The processor would mispredict half of the branches of a binary
@@ -22,6 +25,9 @@ INLINE int64_t bracket(const store_tables *tables, int64_t group, double t, int6
     double low_dpt = values_dpt[upper > first ? upper - 1 : first];
     double span_dpt = values_dpt[upper] - low_dpt;
     *share = clipped((t - low_dpt) / (span_dpt > 0.0 ? span_dpt : 1.0), 0.0, 1.0);
+    /* At a node, rounding must not read its neighbor, too. */
+    if (*share < NODE_SHARE) *share = 0.0;
+    if (*share > 1.0 - NODE_SHARE) *share = 1.0;
     return upper;
 }
 

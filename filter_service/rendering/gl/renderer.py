@@ -27,6 +27,7 @@ from filter_service.rendering.engine import (
     input_notes,
     output_array,
     sampled_input_notes,
+    with_exact_psfs,
 )
 from filter_service.rendering.frame_kernels import MissingPsfs
 from filter_service.rendering.gl.frame_run import EyeStates, FrameRun
@@ -74,6 +75,7 @@ class FilterRenderer(OneView):
             In addition to the errors of `FrameEngine.begin`.
         """
         gaze = check_request(request, request.handle.store.spec)
+        request = with_exact_psfs(self, request)
         if isinstance(request.view, TextureView):
             found = self._filter_textures(request, *gaze)
             return lambda: found

@@ -117,7 +117,7 @@ class NativeStore(FrameStore):
     @property
     def memory_mb(self) -> float:
         """Memory of the kernels at all resolutions, MB."""
-        return self.store.memory_mb + 2.0 * sum(self._n_texels[1:]) / 1e6
+        return super().memory_mb + 2.0 * sum(self._n_texels[1:]) / 1e6
 
     def sync(self, library: Loops, threads: int) -> None:
         """Add the kernels that were computed since the last call.

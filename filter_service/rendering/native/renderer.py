@@ -24,6 +24,7 @@ from filter_service.rendering.engine import (
     check_request,
     input_notes,
     output_array,
+    with_exact_psfs,
 )
 from filter_service.rendering.frame import (
     Merging,
@@ -173,10 +174,12 @@ class NativeRenderer(OneView):
             Out of memory, or the view is in textures; in addition to the errors of
             `FrameEngine.begin`.
         """
-        handle, timer = request.handle, request.times
-        gaze_deg, gaze_notes = check_request(request, handle.store.spec)
-        if not isinstance(request.view, RgbdView):
+        view = request.view
+        gaze_deg, gaze_notes = check_request(request, request.handle.store.spec)
+        if not isinstance(view, RgbdView):
             raise RenderFailed("frames in textures need the engine gl")
+        request = with_exact_psfs(self, request)
+        handle, timer = request.handle, request.times
         self._times = timer
         eye = self._eyes.of(handle)
         layers = handle.layers(timer, request.state, request.options)
@@ -186,7 +189,7 @@ class NativeRenderer(OneView):
             image = handle.cells(timer, gaze_deg, cell_px)
             try:
                 rendered = self._render(
-                    request, request.view, gaze_deg, eye, layers, image, fill
+                    request, view, gaze_deg, eye, layers, image, fill
                 )
                 break
             except KernelsTooLarge:

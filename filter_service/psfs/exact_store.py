@@ -1,0 +1,190 @@
+"""PSFs of one state, computed at the layers of its frames.
+
+Frames with a render tolerance of 0 read no PSFs between nodes of pupil, accommodation
+or defocus: every PSF is computed for the pupil and the focus of the frame, at the total
+defocus of a layer.  What remains is the interpolation between layers and over the
+field.  Nodes of the field are `FIELD_PARTS` times as dense as in the plan of the eye,
+and do not depend on the state, so frames change continuously with it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from filter_service.planning.defocus_nodes import (
+    GroupRays,
+    limited_defocus,
+    node_blur_px,
+)
+from filter_service.planning.grid import GREEN
+from filter_service.planning.node_wavefronts import NodeWavefronts, PupilStates
+from filter_service.planning.nodes import PlanAxes, PlanNodes, RaggedNodes
+from filter_service.psfs.frame_layers import edge_reach_px, frame_layers
+from filter_service.psfs.pack import StateReads
+from filter_service.psfs.store import PsfStore
+from filter_service.view_state import State
+
+FIELD_PARTS = {"dynamic": 2, "quality": 3}
+FINE_PARTS = 1
+"""Parts of each interval between the field nodes of an eye's plan, by mode, and added
+parts with tolerance "fine"."""
+
+LAYER_STEP_RATIO = {"on-axis": 0.1, "quality": 0.1, "dynamic": 0.2}
+"""Steps between layers relative to the default."""
+
+RAYS_FROM_DB = {"on-axis": 64.0, "quality": 58.0, "dynamic": 54.0}
+FINE_DB = 4.0
+"""Predicted PSNR from which PSFs are computed by ray optics, by mode, and what the
+tolerance "fine" adds."""
+
+KEPT_ENERGY_RATIO = 0.998
+
+
+class ExactStore(PsfStore):
+    """PSFs of one state of an eye, for frames with a render tolerance of 0.
+
+    Parameters
+    ----------
+    base : PsfStore
+        Store of the eye, which determines the layers and the field nodes.
+    state : State
+        Pupil, focus and gaze of the frame; the gaze is within the prepared range.
+    object_range_dpt : (low, high)
+        Object distances of the frame.
+    fewer_parts : int
+        Number by which the parts of each field interval are reduced, to save memory.
+
+    Attributes
+    ----------
+    layers : FrameLayers
+        Layers of all frames in this state.
+    field_parts : int
+        Parts of each interval between field nodes of the eye's plan.
+    """
+
+    def __init__(
+        self,
+        base: PsfStore,
+        state: State,
+        object_range_dpt: tuple[float, float],
+        *,
+        fewer_parts: int = 0,
+    ) -> None:
+        step_ratio = LAYER_STEP_RATIO[base.spec.settings.mode]
+        layers = frame_layers(base, state, step_ratio=step_ratio)
+        spec = replace(
+            base.spec.with_settings(gaze_deg=state.gaze_deg, gaze_range_deg=(0.0, 0.0)),
+            kept_energy_ratio=KEPT_ENERGY_RATIO,
+            rays_from_db=RAYS_FROM_DB[base.spec.settings.mode]
+            + (FINE_DB if base.spec.settings.tolerance == "fine" else 0.0),
+            is_exact=True,
+        )
+        pupil_mm = layers.state.pupil_diameter_mm
+        accommodation_dpt = base.eye.accommodation_dpt(
+            state.focus_dpt, pupil_diameter_mm=pupil_mm
+        )
+        parts = FIELD_PARTS.get(spec.settings.mode, 1)
+        if spec.settings.tolerance == "fine" and spec.follows_field:
+            parts += FINE_PARTS
+        self.field_parts = max(parts - fewer_parts, 1)
+        axes = PlanAxes(
+            h_deg=_divided(base.plan.h_deg, self.field_parts),
+            v_deg=_divided(base.plan.v_deg, self.field_parts),
+            pupils_mm=np.array([pupil_mm]),
+            accommodations_dpt=np.array([accommodation_dpt]),
+        )
+        super().__init__(base.eye, spec, axes, engine=base.engine)
+        at_infinity_dpt, change = self.defocus.state(
+            pupil_diameter_mm=pupil_mm, accommodation_dpt=accommodation_dpt
+        )
+        zero_dpt = at_infinity_dpt - self.defocus.change_at_nodes_dpt(change)
+        layer_dpt = _covering(
+            layers.layer_dpt, np.add(layers.vergence_range_dpt, change.range_dpt)
+        )
+        used_dpt = base.eye.vergence.vergence_dpt(np.array(object_range_dpt))
+        first, last = np.searchsorted(layer_dpt, used_dpt + change.range_dpt)
+        used_layer_dpt = layer_dpt[max(first - 1, 0) : last + 2]
+        nodes = self._nodes(pupil_mm, accommodation_dpt, zero_dpt, used_layer_dpt)
+        self._add_nodes([(0, 0)], nodes)
+        self.layers = replace(
+            layers,
+            layer_dpt=layer_dpt,
+            field=change,
+            layer_zero_dpt=zero_dpt,
+            reads=StateReads(np.zeros(1, np.int64), np.ones(1), np.ones(1)),
+            tables=self.tables,
+            edge_reach_px=edge_reach_px(spec, pupil_mm),
+        )
+
+    def _nodes(
+        self,
+        pupil_mm: float,
+        accommodation_dpt: float,
+        zero_dpt: NDArray[np.float64],
+        layer_dpt: NDArray[np.float64],
+    ) -> PlanNodes:
+        """Return the nodes of all field nodes: one at each layer."""
+        eye, spec = self.eye, self.spec
+        h_deg, v_deg = self.plan.field_nodes_deg
+        groups = PupilStates.of(
+            h_deg=h_deg,
+            v_deg=v_deg,
+            pupil_diameter_mm=pupil_mm,
+            accommodation_dpt=accommodation_dpt,
+            wavelength_nm=spec.channel_wavelengths_nm[GREEN],
+            total_defocus_dpt=0.0,
+        )
+        wavefronts = NodeWavefronts.of(eye, spec, groups)
+        rays = GroupRays.of(wavefronts)
+        whole_dpt = np.stack(
+            [zero_dpt.min(axis=1) + layer_dpt[0], zero_dpt.max(axis=1) + layer_dpt[-1]],
+            axis=-1,
+        )
+        limited_dpt, shrink_ratio = limited_defocus(eye, spec, groups, rays, whole_dpt)
+        defocus = RaggedNodes.of(
+            [
+                _within(layer_dpt, low - own.min(), high - own.max())
+                for own, (low, high) in zip(zero_dpt, limited_dpt, strict=True)
+            ]
+        )
+        if np.any(shrink_ratio != 1.0):
+            wavefronts = wavefronts.scaled(shrink_ratio)
+        if spec.settings.lateral_color and spec.settings.chromatic:
+            wavefronts = wavefronts.with_lateral_color(eye, spec, groups)
+        return PlanNodes(
+            defocus=defocus,
+            channel_shift_dpt=zero_dpt,
+            blur_px=node_blur_px(eye, spec, rays, defocus, zero_dpt, shrink_ratio),
+            is_limited=np.any(limited_dpt != whole_dpt, axis=1),
+            shrink_ratio=shrink_ratio,
+            wavefronts=wavefronts,
+        )
+
+
+def _divided(axis: NDArray[np.float64], parts: int) -> NDArray[np.float64]:
+    """Return an axis with each interval divided into equal parts."""
+    places = np.arange(parts * (axis.size - 1) + 1) / parts
+    return np.interp(places, np.arange(axis.size), axis)
+
+
+def _covering(
+    layer_dpt: NDArray[np.float64], range_dpt: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return layers with the ends of a range, if they do not reach these."""
+    return np.unique(np.clip(np.append(layer_dpt, range_dpt), *range_dpt))
+
+
+def _within(
+    layer_dpt: NDArray[np.float64], low_dpt: float, high_dpt: float
+) -> NDArray[np.float64]:
+    """Return the layers in a range, or the one nearest to its middle."""
+    margin_dpt = 1e-9  # of rounding
+    is_within = layer_dpt >= low_dpt - margin_dpt
+    found = layer_dpt[is_within & (layer_dpt <= high_dpt + margin_dpt)]
+    if found.size:
+        return found
+    nearest = np.abs(layer_dpt - 0.5 * (low_dpt + high_dpt)).argmin()
+    return layer_dpt[nearest : nearest + 1]
