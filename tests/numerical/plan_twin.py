@@ -4,8 +4,6 @@ Twins of `psfs/pack.py`, of `rendering` (`frame_kernels.py`, `image_cells.py`), 
 the passes that plan kernels, and of the layers' distances.
 """
 
-import math
-
 import numpy as np
 
 from filter_service.constants import (
@@ -19,7 +17,8 @@ from filter_service.constants import (
     RGB,
     WEIGHT_MAX,
 )
-from filter_service.planning.grid import BASE_OBJECT_STEP_DPT
+from filter_service.planning.grid import BASE_OBJECT_STEP_DPT, GREEN
+from filter_service.psfs.frame_layers import LAYER_SPACING
 from filter_service.psfs.pack import box_sizes, pack_reach
 
 
@@ -48,15 +47,21 @@ def layer_blur_px(store, reads, zero_dpt, at_dpt):
 
 
 def layer_distances_dpt(
-    object_range_dpt, *, ends_dpt, blur_radius_px, blur_px_per_dpt, blur_ratio
+    object_range_dpt,
+    *,
+    ends_dpt,
+    in_focus_dpt,
+    blur_radius_px,
+    blur_px_per_dpt,
+    blur_ratio,
 ):
-    """Walk from node to node; a layer wherever a whole step has gone by."""
+    """Walk from node to node; a layer wherever a step from the focus has gone by."""
     low_dpt, high_dpt = object_range_dpt
-    count = 1 + math.ceil((high_dpt - low_dpt) / BASE_OBJECT_STEP_DPT - 1e-9)
-    inside = [d for d in ends_dpt if low_dpt < d < high_dpt]
-    nodes = sorted({*np.linspace(low_dpt, high_dpt, max(count, 1)), *inside})
+    inside = [d for d in (*ends_dpt, *in_focus_dpt) if low_dpt < d < high_dpt]
+    regular = np.arange(low_dpt, high_dpt, BASE_OBJECT_STEP_DPT)
+    nodes = sorted({*regular, *inside, high_dpt})
     blur_px = blur_radius_px(np.array(nodes))
-    layers, stretch = [nodes[0]], []
+    gone_by = [0.0]
     for k in range(len(nodes) - 1):
         steps = []
         for a, b in zip(blur_px[k], blur_px[k + 1], strict=True):
@@ -65,26 +70,11 @@ def layer_distances_dpt(
             gap_dpt = max(gap_px / blur_px_per_dpt, BASE_OBJECT_STEP_DPT)
             steps.append(abs(a - b) / max(blur_ratio * least_px, 0.25))
             steps.append((nodes[k + 1] - nodes[k]) / gap_dpt)
-        stretch.append((nodes[k], nodes[k + 1], max(steps)))
-        if nodes[k + 1] in inside or k == len(nodes) - 2:
-            layers += _layers_of(stretch)
-            stretch = []
-    return np.array(layers)
-
-
-def _layers_of(stretch):
-    """Ends of equal shares of a stretch's steps; (low, high, steps) of each part."""
-    total = sum(steps for _, _, steps in stretch)
-    count = max(math.ceil(total - 1e-9), 1)
-    layers = []
-    for n in range(1, count):
-        left = n * total / count
-        for low_dpt, high_dpt, steps in stretch:
-            if left <= steps:
-                layers.append(low_dpt + left / steps * (high_dpt - low_dpt))
-                break
-            left -= steps
-    return [*layers, stretch[-1][1]]
+        gone_by.append(gone_by[-1] + max(steps))
+    steps = (gone_by - np.interp(in_focus_dpt[GREEN], nodes, gone_by)) / LAYER_SPACING
+    layers = np.interp(np.arange(np.ceil(steps[0]), steps[-1]), steps, nodes)
+    ends = [d for d in ends_dpt if low_dpt < d < high_dpt]
+    return np.array(sorted({*layers, *ends, low_dpt, high_dpt}))
 
 
 def map_tables(node_from_cell):

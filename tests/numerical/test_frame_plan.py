@@ -132,7 +132,8 @@ def test_layers_are_those_of_the_plain_statement_or_as_close(case):
     ]
     expected_dpt = plan_twin.layer_distances_dpt(
         tuple(np.add(layers.vergence_range_dpt, layers.field.range_dpt)),
-        ends_dpt=np.append(-zero_dpt[gaze], ends_dpt),
+        ends_dpt=ends_dpt,
+        in_focus_dpt=-zero_dpt[gaze],
         blur_radius_px=lambda d: plan_twin.layer_blur_px(store, reads, zero_dpt, d),
         blur_px_per_dpt=layers.blur_px_per_dpt,
         blur_ratio=0.1 if store.spec.settings.mode == "dynamic" else 0.05,

@@ -1,8 +1,5 @@
 """Places of a frame's layers, from the formulas."""
 
-import math
-from itertools import pairwise
-
 import numpy as np
 
 
@@ -20,23 +17,21 @@ def step_curve(blur_px, at_dpt, *, blur_ratio, px_per_dpt):
     return np.append(0.0, np.cumsum(np.maximum(steps, gaps)))
 
 
-def layer_distances_dpt(steps_at, range_dpt, ends_dpt, *, step_dpt=0.25):
-    """Layers at equal parts of the steps between ends, at most one step apart.
+def layer_distances_dpt(steps_at, range_dpt, ends_dpt, known_dpt, *, step_dpt=0.25):
+    """Layers at whole numbers of steps, and at ends, which replace layers beside them.
 
     Parameters
     ----------
     steps_at : callable
-        Number of steps up to vergences (n,), read at the ends and every ``step_dpt``.
+        Number of steps up to vergences (n,), read at the ends, at ``known_dpt`` and
+        every ``step_dpt``.
     """
     low_dpt, high_dpt = range_dpt
-    inside = {end for end in ends_dpt if low_dpt < end < high_dpt}
-    count = 1 + math.ceil((high_dpt - low_dpt) / step_dpt - 1e-9)
-    at_dpt = np.array(sorted({*np.linspace(low_dpt, high_dpt, count), *inside}))
+    ends = {low_dpt, high_dpt, *(end for end in ends_dpt if low_dpt < end < high_dpt)}
+    known = {end for end in known_dpt if low_dpt < end < high_dpt}
+    at_dpt = np.array(sorted({*np.arange(low_dpt, high_dpt, step_dpt), *ends, *known}))
     steps = steps_at(at_dpt)
-    layers_dpt = [np.array([low_dpt])]
-    stops = np.interp([low_dpt, *sorted(inside), high_dpt], at_dpt, steps)
-    for first, last in pairwise(stops):
-        parts = max(math.ceil(last - first - 1e-9), 1)
-        wanted = np.linspace(first, last, parts + 1)[1:]
-        layers_dpt.append(np.interp(wanted, steps, at_dpt))
-    return np.concatenate(layers_dpt)
+    whole = np.arange(np.ceil(steps[0]), steps[-1])
+    at_ends = np.interp(sorted(ends), at_dpt, steps)
+    whole = whole[np.abs(whole[:, None] - at_ends).min(axis=1) > 1e-3]
+    return np.array(sorted({*np.interp(whole, steps, at_dpt), *ends}))
