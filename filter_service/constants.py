@@ -92,7 +92,21 @@ DISCONTINUITY_PX = 0.25
 tiles need no order: at this slope the weights of a surface still sum to 1 within 3 %,
 which is normalized away.  Where order matters, fragments whose blur differs by less are
 of one depth and share the coverage that nearer ones leave free; hidden pixels whose
-blur differs by less make no fragment."""
+blur differs by less make no fragment.  Edges and hidden pixels have their full effect
+at twice this difference, and none at this one."""
+
+EDGE_MIX_COVERAGE = 0.002
+"""Light of edge pixels, weighted with their strength, from which on a pixel takes the
+light by depths alone.  Below, it takes part of the light without depths, so that the
+order of depths sets in gradually where the light of an edge ends."""
+
+GROUP_BLEND_RATIO = 0.2
+"""Last part of a depth group in which fragments pass gradually to the next group.
+Groups are `DISCONTINUITY_PX` of blur deep, at fixed depths."""
+
+EXCESS_RATIO = 4.0
+"""Light above this times the mean of the surroundings is not amplified where coverage
+is missing: a lamp beside a near edge is not a surface that continues behind it."""
 
 NOTHING_DPT = -1.0
 """Object distance of an empty hidden pixel."""

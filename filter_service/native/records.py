@@ -26,7 +26,15 @@ FRAGMENT = np.dtype(
         ("radius_px", "<u2"),
     ]
 )
-FRAGMENT_LIGHT = np.dtype([("rgb", "<f4", 3), ("depth", "<f4")])
+FRAGMENT_LIGHT = np.dtype(
+    [
+        ("rgb", "<f4", 3),
+        ("depth", "<f4"),
+        ("strength", "<f4"),
+        ("coverage", "<f4"),
+        ("excess", "<f4"),
+    ]
+)
 BLOCK = np.dtype(
     [
         ("first", "<u4"),
@@ -76,6 +84,7 @@ class Frame(c.Structure):
         ("row_scratch", POINTER),
         ("dpt", POINTER),
         ("position", POINTER),
+        ("block_light", POINTER),
         ("used", POINTER),
         ("missing_count", c.c_int64),
         ("clamped_count", c.c_int64),

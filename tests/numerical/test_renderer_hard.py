@@ -64,7 +64,7 @@ def test_merged_squares_under_the_widest_kernel_lose_nothing(engine):
         height_px=height_px,
         spread_px=64.0,
     )
-    image = np.zeros((height_px, width_px, 3), np.float32)
+    image = np.full((height_px, width_px, 3), 0.25, np.float32)  # no light in excess
     image[8:16, 0:8] = 1.0
     merged = bench.render(image, render_tolerance=0.1)  # in no coarser pixels
     assert merged.merged_count == image[..., 0].size

@@ -6,7 +6,7 @@ planned layers.
 """
 
 from dataclasses import replace
-from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -15,10 +15,13 @@ from scipy.ndimage import map_coordinates
 
 from filter_service.constants import (
     DISCONTINUITY_PX,
-    MIN_BLUR_RANGE,
+    EDGE_MIX_COVERAGE,
+    EXCESS_RATIO,
+    GROUP_BLEND_RATIO,
     MIN_COVERAGE,
     PAPER_FAR_M,
     PAPER_TIE_BREAK_M,
+    TILE_SIZE_PX,
 )
 from filter_service.psfs.frame_layers import FrameLayers
 from filter_service.psfs.store import PsfStore
@@ -195,15 +198,15 @@ def gather(
     kernel_of = np.zeros(used.shape, np.int64)
     kernel_of[kernels.cells, kernels.intervals] = np.arange(kernels.count)
     kernel = kernel_of[cell, interval]
-    step_dpt = DISCONTINUITY_PX / max(layers.blur_px_per_dpt, MIN_BLUR_RANGE)
-    is_paper = accumulation == "paper"
+    key = _sort_key(distances_dpt, accumulation)
+    sources = _sources(linear, distances_dpt, layers, key)
     out = _gather(
-        linear,
+        linear[0],
         np.where(holds, kernel, NOTHING),
         position - interval,
-        _sort_key(distances_dpt, accumulation),
+        key,
         kernel_pairs(store, kernels),
-        _over if is_paper else partial(_by_depths, depth_step=step_dpt),
+        sources.over if accumulation == "paper" else sources.by_depths,
         range(border_px, view.height_px - border_px)[::row_step],
     )
     return out[:, border_px : view.width_px - border_px]
@@ -215,13 +218,40 @@ def surface_vergences_dpt(view: RgbdView, layers: FrameLayers) -> NDArray[np.flo
     Hidden pixels that blur like the surface in front of them count as empty.
     """
     seen_dpt = layers.vergence.vergence_dpt(object_dpt(view, view.depth_m))
-    vergences = [seen_dpt]
+    vergences = [np.clip(seen_dpt, *layers.vergence_range_dpt)]
     for hidden_m in view.surface_depths_m[1:]:
         distance_dpt = object_dpt(view, np.where(hidden_m > 0.0, hidden_m, np.nan))
         hidden_dpt = layers.vergence.vergence_dpt(distance_dpt)
-        behind_px = (seen_dpt - hidden_dpt) * layers.blur_px_per_dpt
-        vergences.append(np.where(behind_px > DISCONTINUITY_PX, hidden_dpt, np.nan))
-    return np.clip(vergences, *layers.vergence_range_dpt)
+        hidden_dpt = np.clip(hidden_dpt, *layers.vergence_range_dpt)
+        appears = _beyond_surface(vergences[0] - hidden_dpt, layers) > 0.0
+        vergences.append(np.where(appears, hidden_dpt, np.nan))
+    return np.stack(vergences)
+
+
+def _beyond_surface(step_dpt: NDArray, layers: FrameLayers) -> NDArray[np.float64]:
+    """Return how clearly a step of vergence leads to another surface, 0 to 1."""
+    step_px = step_dpt * layers.blur_px_per_dpt
+    return np.clip(step_px / DISCONTINUITY_PX - 1.0, 0.0, 1.0)
+
+
+def _edge_strength(seen_dpt: NDArray, layers: FrameLayers) -> NDArray[np.float64]:
+    """Return the strength (height, width) of edges of the visible surface."""
+    steps_dpt = np.zeros((4, *seen_dpt.shape))
+    steps_dpt[0, 1:] = steps_dpt[1, :-1] = np.abs(np.diff(seen_dpt, axis=0))
+    steps_dpt[2, :, 1:] = steps_dpt[3, :, :-1] = np.abs(np.diff(seen_dpt, axis=1))
+    return _beyond_surface(steps_dpt.max(axis=0), layers) ** 2
+
+
+def _usual_light(linear: NDArray) -> NDArray[np.float64]:
+    """Return the mean light (height, width, 3) of the blocks around each pixel's."""
+    height, width = linear.shape[:2]
+    rows, columns = (-(-n // TILE_SIZE_PX) for n in (height, width))
+    y, x = (np.arange(n) // TILE_SIZE_PX for n in (height, width))
+    sums = np.zeros((rows + 2, columns + 2, 4))
+    values = np.concatenate([linear, np.ones((height, width, 1))], axis=-1)
+    np.add.at(sums, (y[:, None] + 1, x + 1), values)
+    around = sliding_window_view(sums, (3, 3), (0, 1)).sum(axis=(-2, -1))
+    return (around[..., :3] / around[..., 3:])[y[:, None], x]
 
 
 def _linear_color(color: NDArray) -> NDArray[np.float64]:
@@ -239,6 +269,81 @@ def _sort_key(distances_dpt: NDArray, accumulation: str) -> NDArray[np.float64]:
     n_pixels = distance_m[0].size
     scan = np.arange(n_pixels).reshape(distance_m[0].shape) / n_pixels
     return distance_m + PAPER_TIE_BREAK_M * scan
+
+
+class _Sources(NamedTuple):
+    """Pixels of all surfaces (n,) as sources of light; ``linear`` is (n, 3).
+
+    ``place`` is the depth in groups of depths.
+    """
+
+    linear: NDArray
+    place: NDArray
+    coverage: NDArray
+    strength: NDArray
+    excess: NDArray
+    is_visible: NDArray
+
+    def over(self, weight, source, own):
+        """Return the light by the paper's rule: a weight is an opacity."""
+        left = np.cumprod(1.0 - weight, axis=-2)
+        free = np.concatenate(
+            [np.ones_like(left[..., :1, :]), left[..., :-1, :]], axis=-2
+        )
+        light = (free * weight * self.linear[source]).sum(axis=-2)
+        return _shown(light, (free * weight).sum(axis=-2), 0.0, own)
+
+    def by_depths(self, weight, source, own):
+        """Return the light by depths where light of edges arrives, else the sum.
+
+        The fragments of one depth share the free coverage in proportion to their
+        weights.  If the first took its full weight, a partly hidden surface would be
+        lit by one side of the kernel only.
+        """
+        mean = weight.mean(axis=-1)
+        sums = np.concatenate(
+            [
+                weight * self.linear[source],
+                weight * self.coverage[source][..., None],
+                (mean * self.excess[source])[..., None],
+            ],
+            axis=-1,
+        )
+        near = _by_groups(self.place[source], sums)
+        visible = (sums * self.is_visible[source][..., None]).sum(axis=-2)
+        edge = (mean * self.strength[source]).sum(axis=-1, keepdims=True)
+        ordered, unordered = (
+            _shown(total[..., :3], total[..., 3:6], total[..., 6:], own)
+            for total in (near, visible)
+        )
+        share = np.minimum(edge / EDGE_MIX_COVERAGE, 1.0)
+        return unordered + share * (ordered - unordered)
+
+
+def _sources(linear, distances_dpt, layers, key) -> _Sources:
+    seen_dpt, hidden_dpt = distances_dpt[0], distances_dpt[1:]
+    strength, coverage = np.zeros_like(key), np.ones_like(key)
+    strength[0] = _edge_strength(seen_dpt, layers)
+    coverage[1:] = _beyond_surface(seen_dpt - hidden_dpt, layers)
+    coverage[np.isnan(coverage)] = 0.0
+    is_visible = np.zeros(key.shape, bool)
+    is_visible[0] = True
+    linear = linear * coverage[..., None]
+    usual = EXCESS_RATIO * _usual_light(linear[0])
+    excess = np.maximum(linear - usual * coverage[..., None], 0.0).mean(axis=-1)
+    place = key * layers.blur_px_per_dpt / DISCONTINUITY_PX
+    flat = (values.ravel() for values in (place, coverage, strength, excess))
+    return _Sources(linear.reshape(-1, 3), *flat, is_visible.ravel())
+
+
+def _shown(light, coverage, excess, own):
+    """Return light over coverage; missing coverage does not amplify the excess."""
+    mean = light.mean(axis=-1, keepdims=True)
+    share = np.where(mean > 0.0, excess / np.where(mean > 0.0, mean, 1.0), 0.0)
+    lacking = np.maximum(1.0 - coverage, 0.0)
+    shown = light / np.maximum(coverage, MIN_COVERAGE)
+    shown = shown * (1.0 - np.minimum(share, 1.0) * lacking)
+    return np.where(coverage >= MIN_COVERAGE, shown, own)
 
 
 def _gather(linear, kernel, fraction, key, kernels, accumulate, rows):
@@ -285,48 +390,40 @@ def _gather(linear, kernel, fraction, key, kernels, accumulate, rows):
         own = np.where(found, kernel.ravel()[source], NOTHING)
         near, far = kernels[own, 0, y, x], kernels[own, 1, y, x]
         weight = near + fraction.ravel()[source][..., None] * (far - near)
-        light, coverage = accumulate(
-            np.where(found, key.ravel()[source], np.inf),
-            weight,
-            weight * linear.reshape(-1, 3)[source],
-        )
-        out[first : first + block] = np.where(
-            coverage >= MIN_COVERAGE,
-            light / np.maximum(coverage, MIN_COVERAGE),
-            linear[0, here],
-        )
+        weight *= found[..., None]
+        out[first : first + block] = accumulate(weight, source, linear[here])
     return out
 
 
-def _over(key, weight, light):
-    """Return light and coverage by the paper's rule: a weight is an opacity."""
-    left = np.cumprod(1.0 - weight, axis=-2)
-    free = np.concatenate([np.ones_like(left[..., :1, :]), left[..., :-1, :]], axis=-2)
-    return (free * light).sum(axis=-2), (free * weight).sum(axis=-2)
+def _by_groups(place, sums):
+    """Return sums (..., n, 7) of light, coverage and excess, group after group.
 
-
-def _by_depths(key, weight, light, *, depth_step):
-    """Return light and coverage, accumulated one depth after the other.
-
-    The fragments of one depth share the free coverage in proportion to their weights.
-    If the first took its full weight, a partly hidden surface would be lit by one side
-    of the kernel only.
+    In the last part of a group, a fragment passes gradually to the next one.
     """
-    n_columns = key.shape[-1]
-    key = key.reshape(-1, n_columns)
-    sums = np.zeros((2, len(key), n_columns + 1, 3))
-    np.cumsum(light.reshape(-1, n_columns, 3), axis=1, out=sums[0, :, 1:])
-    np.cumsum(weight.reshape(-1, n_columns, 3), axis=1, out=sums[1, :, 1:])
-    total = np.zeros((2, len(key), 3))
-    count = np.isfinite(key).sum(axis=1)
-    first = np.zeros(len(key), np.int64)
-    at = np.flatnonzero(count)
+    shape, n_columns = place.shape[:-1], 2 * place.shape[-1]
+    number = np.floor(place)
+    later = np.maximum(place - number - (1.0 - GROUP_BLEND_RATIO), 0.0)
+    later /= GROUP_BLEND_RATIO
+    group = np.concatenate([number, number + 1.0], axis=-1).reshape(-1, n_columns)
+    parts = np.concatenate(
+        [sums * (1.0 - later)[..., None], sums * later[..., None]], axis=-2
+    ).reshape(-1, n_columns, 7)
+    order = np.argsort(group, axis=1, kind="stable")
+    group = np.take_along_axis(group, order, axis=1)
+    before = np.zeros((len(group), n_columns + 1, 7))
+    np.cumsum(
+        np.take_along_axis(parts, order[..., None], axis=1), axis=1, out=before[:, 1:]
+    )
+    total = np.zeros((len(group), 7))
+    first = np.zeros(len(group), np.int64)
+    at = np.arange(len(group))
     while at.size:
-        nearest = key[at, first[at]]
-        end = (key[at] - nearest[:, None] <= depth_step).sum(axis=1)
-        own = sums[:, at, end] - sums[:, at, first[at]]
-        room = 1.0 - total[1, at]
-        total[:, at] += np.minimum(room / np.maximum(own[1], MIN_COVERAGE), 1.0) * own
+        end = (group[at] <= group[at, first[at]][:, None]).sum(axis=1)
+        own = before[at, end] - before[at, first[at]]
+        room = 1.0 - total[at, 3:6]
+        share = np.minimum(room / np.maximum(own[:, 3:6], MIN_COVERAGE), 1.0)
+        # the excess takes the share of green
+        total[at] += np.concatenate([share, share, share[:, 1:2]], axis=1) * own
         first[at] = end
-        at = at[end < count[at]]
-    return total.reshape(2, *weight.shape[:-2], 3)
+        at = at[end < n_columns]
+    return total.reshape(*shape, 7)

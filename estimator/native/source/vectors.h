@@ -180,6 +180,11 @@ INLINE f32x8 across8(f32x8 value, int level) {
 #endif
 }
 
+/* Copies the second of each four lanes to the fourth. */
+INLINE f32x8 second_as_fourth8(f32x8 value) {
+    return MIXED(value, value, 0, 1, 2, 1, 4, 5, 6, 5);
+}
+
 /* Eight 16-bit words as floats. */
 INLINE f32x8 floats_of(u16x8 words) {
     return __builtin_convertvector(__builtin_convertvector(words, i32x8), f32x8);

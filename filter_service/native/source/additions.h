@@ -10,6 +10,11 @@ typedef struct {
     int left, top;            /* first column and row of the kernel in the raster */
 } reading;
 
+/* Fragments of the hidden surface follow those of the visible one. */
+INLINE int is_hidden(const frame *f, uint32_t index) {
+    return index >= (uint32_t)(f->block_rows * f->block_columns * BLOCK_PIXELS);
+}
+
 INLINE const level_image *image_of(const frame *f, const fragment *one) {
     return f->kernels[one->state & KERNEL_MASK].level + (one->state >> LEVEL_SHIFT & 3);
 }
@@ -111,18 +116,21 @@ static void add_both(const addition *a, const addition *b) {
 #undef CASE
 }
 
-/* Prepares the addition of a fragment to a window; false if it lights only other parts of
- * the bin. */
-INLINE int prepare_addition(const frame *f, uint32_t index, window *w, addition *a) {
+/* Prepares the addition of a share of a fragment to a group; false if it lights only other
+ * parts of the bin. */
+INLINE int prepare_addition(const frame *f, uint32_t index, float share, depth_group *group,
+                            addition *a) {
     const fragment *one = f->fragments + index;
-    const float *rgb = f->lights[index].rgb;
+    const fragment_light *light = f->lights + index;
     const level_image *image = image_of(f, one);
-    raster *own = w->open + image->resolution;
+    raster *own = group->sizes + image->resolution;
     reading r = start_reading(one, image, own);
     meeting m = meet(&r, own);
     if (m.pairs <= 0 || m.rows <= 0) return 0;
-    float scale = image->scale;
-    float red = scale * rgb[0], green = scale * rgb[1], blue = scale * rgb[2];
+    float scale = image->scale * share;
+    float red = scale * light->rgb[0], green = scale * light->rgb[1];
+    float blue = scale * light->rgb[2], strength = scale * light->strength;
+    float coverage = scale * light->coverage, excess = scale * light->excess;
     own->is_lit = 1;
     a->to = own->pairs + (m.row + r.top) * own->stride + m.pair;
     a->to_stride = own->stride;
@@ -131,8 +139,9 @@ INLINE int prepare_addition(const frame *f, uint32_t index, window *w, addition 
     a->from = row_texels(f, &r, m.row) + 8 * m.pair;
     a->from_stride = 4 * (image->width + 1);
     a->factors = r.factors;
-    a->color = (f32x8){red, green, blue, 0.0f, red, green, blue, 0.0f};
-    a->scales = all8(scale);
+    a->color = (f32x8){red, green, blue, strength, red, green, blue, strength};
+    a->scales = (f32x8){coverage, coverage, coverage, excess,
+                        coverage, coverage, coverage, excess};
     return 1;
 }
 
@@ -147,9 +156,10 @@ INLINE void flush_additions(additions *all) {
     all->waiting = 0;
 }
 
-INLINE void add_fragment(const frame *f, uint32_t index, window *w, additions *all) {
+INLINE void add_fragment(const frame *f, uint32_t index, float share, depth_group *group,
+                         additions *all) {
     addition *newest = all->two + all->waiting;
-    if (!prepare_addition(f, index, w, newest)) return;
+    if (!prepare_addition(f, index, share, group, newest)) return;
     if (!all->waiting) {
         all->waiting = 1;
         return;
@@ -170,8 +180,9 @@ INLINE void cover_with_fragment(const frame *f, uint32_t index, const window *w)
     const fragment *one = f->fragments + index;
     const float *rgb = f->lights[index].rgb;
     const level_image *image = image_of(f, one);
-    reading r = start_reading(one, image, w->open);
-    meeting m = meet(&r, w->open);
+    const raster *own = w->open[0].sizes;
+    reading r = start_reading(one, image, own);
+    meeting m = meet(&r, own);
     f32x8 color = {rgb[0], rgb[1], rgb[2], 0.0f, rgb[0], rgb[1], rgb[2], 0.0f};
     int merged = (one->state >> LEVEL_SHIFT & 3) != 0;
     for (int row = m.row; row < m.row + m.rows; ++row) {

@@ -17,8 +17,11 @@ typedef struct {
     float place[BLOCK_PIXELS];       /* in layers */
     float spread_px[BLOCK_PIXELS];
     uint32_t kernel[BLOCK_PIXELS];
+    float strength[BLOCK_PIXELS];    /* of edges of the visible surface, 0 to 1 */
+    float coverage[BLOCK_PIXELS];    /* of hidden pixels, 0 to 1; not set in the visible surface */
+    float bright[RGB];        /* light above which it is not amplified */
     uint64_t held;            /* pixels that are not empty */
-    uint64_t edges;           /* pixels next to another surface */
+    uint64_t edges;           /* pixels next to another surface, or hidden */
     int highest_level;        /* of merging, over the pixels' kernels */
     float tolerance;          /* of merging, at this angle from the gaze */
     float smallest_spread_px; /* of kernels that merge */
@@ -56,8 +59,9 @@ INLINE void copy_around(const block *b, float *dpt) {
     }
 }
 
-/* Pixels with a neighbor on another surface, as seen through this pupil. */
-INLINE uint64_t find_edges(const block *b) {
+/* Finds pixels with a neighbor on another surface, as seen through this pupil, and how much
+ * they count as edges. */
+INLINE uint64_t find_edges(block *b) {
     const frame *f = b->f;
     float copied[AROUND_PX * AROUND_PX];
     const float *above_left = copied;
@@ -77,7 +81,10 @@ INLINE uint64_t find_edges(const block *b) {
         f32x8 along = larger8(size8(load8(left + 1 - stride) - own),
                               size8(load8(left + 1 + stride) - own));
         f32x8 most_px = larger8(across, along) * all8(f->blur_px_per_dpt);
-        edges |= (uint64_t)bits_of8(most_px > all8(DISCONTINUITY_PX)) << (y * TILE_SIZE_PX);
+        f32x8 beyond = most_px * all8(1.0f / DISCONTINUITY_PX) - all8(1.0f);
+        f32x8 strength = smaller8(larger8(beyond, all8(0.0f)), all8(1.0f));
+        store8(b->strength + y * TILE_SIZE_PX, strength * strength);
+        edges |= (uint64_t)bits_of8(strength > all8(0.0f)) << (y * TILE_SIZE_PX);
     }
     return edges;
 }
@@ -96,6 +103,7 @@ INLINE void read_row(block *b, int i, size_t first, int width) {
     size_t pixels = (size_t)f->width * (size_t)f->height;
     const float *dpt = f->dpt + (size_t)b->surface * pixels + first;
     const float *place = f->position + (size_t)b->surface * pixels + first;
+    const float *seen_dpt = f->dpt + first;
     int row = cell_row(f, b->y0 + i / TILE_SIZE_PX);
     int last_pair = -1;
     uint32_t kernel = 0;
@@ -112,6 +120,10 @@ INLINE void read_row(block *b, int i, size_t first, int width) {
         }
         float change_px = shape->spread_px[1] - shape->spread_px[0];
         f32x4 color = pixel_color(f, b->surface, first + (size_t)x);
+        if (b->surface > 0) {
+            b->coverage[i] = hidden_coverage(f, seen_dpt[x], dpt[x]);
+            color *= all4(b->coverage[i]);
+        }
         for (int c = 0; c < RGB; ++c) b->rgb[c][i] = color[c];
         b->dpt[i] = dpt[x];
         b->place[i] = place[x];
@@ -145,6 +157,36 @@ INLINE void set_limits(block *b) {
     b->smallest_spread_px *= powf(gain, -1.0f / MERGE_CONTRAST_POWER);
 }
 
+/* Sums light over each block of a row; four floats each, the last is the number of pixels. */
+static void sum_block_row(void *argument, int row, int thread) {
+    (void)thread;
+    const frame *f = argument;
+    float *to = f->block_light + 4 * (size_t)row * (size_t)f->block_columns;
+    for (int column = 0; column < f->block_columns; ++column) {
+        int x1 = smaller_int((column + 1) * TILE_SIZE_PX, f->width);
+        int y1 = smaller_int((row + 1) * TILE_SIZE_PX, f->height);
+        f32x4 sum = all4(0.0f);
+        for (int y = row * TILE_SIZE_PX; y < y1; ++y)
+            for (int x = column * TILE_SIZE_PX; x < x1; ++x)
+                sum += pixel_color(f, 0, (size_t)y * (size_t)f->width + (size_t)x);
+        sum[3] = (float)((x1 - column * TILE_SIZE_PX) * (y1 - row * TILE_SIZE_PX));
+        store4(to + 4 * column, sum);
+    }
+}
+
+/* Sets the limit of light that is amplified: EXCESS_RATIO times the mean over this block and
+ * those around it. */
+INLINE void set_bright(block *b, int column, int row) {
+    const frame *f = b->f;
+    f32x4 sum = all4(0.0f);
+    int right = smaller_int(column + 2, f->block_columns);
+    int bottom = smaller_int(row + 2, f->block_rows);
+    for (int y = larger_int(row - 1, 0); y < bottom; ++y)
+        for (int x = larger_int(column - 1, 0); x < right; ++x)
+            sum += load4(f->block_light + 4 * (y * f->block_columns + x));
+    for (int c = 0; c < RGB; ++c) b->bright[c] = EXCESS_RATIO * sum[c] / sum[3];
+}
+
 /* Reads a block; empty pixels stay dark and sharp. */
 INLINE void read_block(block *b, const frame *f, int surface, int column, int row) {
     b->f = f;
@@ -154,6 +196,7 @@ INLINE void read_block(block *b, const frame *f, int surface, int column, int ro
     b->held = 0;
     b->highest_level = 0;
     set_limits(b);
+    set_bright(b, column, row);
     b->edges = surface == 0 ? find_edges(b) : ~(uint64_t)0;
     int width = smaller_int(f->width - b->x0, TILE_SIZE_PX);
     int height = smaller_int(f->height - b->y0, TILE_SIZE_PX);

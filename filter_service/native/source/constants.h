@@ -8,6 +8,9 @@
 #define NEAREST_M 0.02f
 #define MERGE_MIDTONE 0.2f
 #define MERGE_DARKEST 0.0155f
+#define EDGE_MIX_COVERAGE 0.002f
+#define GROUP_BLEND_RATIO 0.2f
+#define EXCESS_RATIO 4.0f
 #define NOTHING_DPT -1.0f
 #define MERGE_MIN_SPREAD_PX 1.5f
 #define MERGE_CONTRAST 0.03f

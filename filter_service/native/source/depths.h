@@ -58,82 +58,147 @@ INLINE void add_quarters(const coarse_row *row, pixel_pair *to, int pairs) {
 
 /* Adds the light of pixels of 2^r px to those of 1 px, interpolated between the centers of
  * four. */
-INLINE void add_coarse(window *w, int r) {
-    raster *coarse = w->open + r;
-    const raster *fine = w->open;
+INLINE void add_coarse(depth_group *group, int r) {
+    raster *coarse = group->sizes + r;
+    const raster *fine = group->sizes;
     coarse_row row;
-    for (int y = 0; y < w->height; ++y) {
+    for (int y = 0; y < fine->height; ++y) {
         float down = ((float)y + 0.5f) / (float)(1 << r) + 0.5f;
         row_between(coarse, coarse->pairs + (int)down * coarse->stride, down - (float)(int)down,
                     &row);
-        if (r == 1) add_halves(&row, fine->pairs + y * fine->stride, w->width / 2);
-        else add_quarters(&row, fine->pairs + y * fine->stride, w->width / 2);
+        if (r == 1) add_halves(&row, fine->pairs + y * fine->stride, fine->width / 2);
+        else add_quarters(&row, fine->pairs + y * fine->stride, fine->width / 2);
     }
     clear_raster(coarse);
 }
 
-/* Converts all light of the open depth to pixels of 1 px. */
-static void gather_sizes(window *w) {
-    if (w->open[1].is_lit) add_coarse(w, 1);
-    if (w->open[2].is_lit) add_coarse(w, 2);
+/* Converts all light of a group to pixels of 1 px; false if it has none. */
+static int gather_sizes(depth_group *group) {
+    int is_lit = group->sizes[0].is_lit;
+    for (int r = 1; r < RESOLUTIONS; ++r) {
+        if (!group->sizes[r].is_lit) continue;
+        is_lit = 1;
+        add_coarse(group, r);
+    }
+    return is_lit;
 }
 
-/* Composites a depth; its fragments share the coverage that nearer ones leave.  Returns
- * whether any coverage is left. */
-static int close_depth(window *w) {
-    gather_sizes(w);
-    f32x8 least = all8(1.0f);
+INLINE float least_color(f32x8 lanes) {
+    float least = lanes[0];
+    for (int i = 1; i < 8; ++i)
+        if (i % 4 != 3) least = smaller_float(lanes[i], least);
+    return least;
+}
+
+/* Whether groups behind the closed ones matter: for the light by depths and the total, only
+ * for the total, or not at all. */
+enum { SEEN, COVERED, UNSEEN };
+
+/* Composites a group; its fragments share the coverage that nearer ones leave. */
+static int close_group(window *w, depth_group *group) {
+    if (!gather_sizes(group)) return SEEN;
+    f32x8 least = all8(1.0f), least_total = all8(1.0f);
     for (int y = 0; y < w->height; ++y) {
-        pixel_pair *open = w->open[0].pairs + y * PAIRS_ACROSS;
+        pixel_pair *open = group->sizes[0].pairs + y * PAIRS_ACROSS;
         pixel_pair *near = w->near + y * PAIRS_ACROSS;
+        pixel_pair *total = w->total + y * PAIRS_ACROSS;
         for (int x = 0; x < w->width / 2; ++x) {
-            f32x8 most = larger8(open[x].coverage, all8(MIN_COVERAGE));
+            f32x8 light = open[x].light, coverage = open[x].coverage;
+            f32x8 most = larger8(coverage, all8(MIN_COVERAGE));
             f32x8 share = smaller8((all8(1.0f) - near[x].coverage) / most, all8(1.0f));
-            near[x].light += share * open[x].light;
-            near[x].coverage += share * open[x].coverage;
+            share = second_as_fourth8(share); /* of green, for the excess */
+            near[x].light += share * light;
+            near[x].coverage += share * coverage;
+            total[x].light += light;
+            total[x].coverage += coverage;
             least = smaller8(near[x].coverage, least);
+            least_total = smaller8(total[x].light, least_total);
             open[x].light = all8(0.0f);
             open[x].coverage = all8(0.0f);
         }
     }
-    float lowest = 1.0f;
-    for (int i = 0; i < 8; ++i)
-        if (i % 4 != 3) lowest = least[i] < lowest ? least[i] : lowest;
-    return lowest < 1.0f;
+    group->sizes[0].is_lit = 0;
+    if (least_color(least) < 1.0f) return SEEN;
+    float strength = smaller_float(least_total[3], least_total[7]);
+    return strength < EDGE_MIX_COVERAGE ? COVERED : UNSEEN;
 }
 
-INLINE int is_beyond(const frame *f, float depth, float open_depth) {
-    return (depth - open_depth) * f->blur_px_per_dpt > DISCONTINUITY_PX;
+/* Adds a group to the total alone. */
+static void add_total(window *w, depth_group *group) {
+    if (!gather_sizes(group)) return;
+    for (int y = 0; y < w->height; ++y) {
+        const pixel_pair *open = group->sizes[0].pairs + y * PAIRS_ACROSS;
+        pixel_pair *total = w->total + y * PAIRS_ACROSS;
+        for (int x = 0; x < w->width / 2; ++x) {
+            total[x].light += open[x].light;
+            total[x].coverage += open[x].coverage;
+        }
+    }
+}
+
+/* Two consecutive groups of depths, and what waits to be added to each. */
+typedef struct {
+    float number;             /* of the nearer group */
+    int nearer;               /* its index in the window, 0 or 1 */
+    int state;
+    additions all[2];
+} depth_walk;
+
+/* Closes the nearer group: the one behind it becomes the nearer one. */
+INLINE void close_nearer(window *w, depth_walk *walk) {
+    depth_group *group = w->open + walk->nearer;
+    flush_additions(walk->all + walk->nearer);
+    if (walk->state == SEEN) walk->state = close_group(w, group);
+    else add_total(w, group);
+    walk->nearer ^= 1;
+}
+
+/* Adds a fragment, nearest first.  In the last part of a group, it passes gradually to the
+ * next one, so that no depth is special. */
+INLINE void add_behind(const frame *f, uint32_t index, window *w, depth_walk *walk) {
+    float place = f->lights[index].depth * f->blur_px_per_dpt * (1.0f / DISCONTINUITY_PX);
+    float number = __builtin_floorf(place);
+    if (walk->state == SEEN && number > walk->number) {
+        close_nearer(w, walk);
+        if (walk->state == SEEN && number > walk->number + 1.0f) close_nearer(w, walk);
+        walk->number = number;
+    }
+    int nearer = walk->nearer;
+    float next = (place - number - (1.0f - GROUP_BLEND_RATIO)) * (1.0f / GROUP_BLEND_RATIO);
+    next = walk->state == SEEN ? larger_float(next, 0.0f) : 0.0f;
+    add_fragment(f, index, 1.0f - next, w->open + nearer, walk->all + nearer);
+    if (next > 0.0f)
+        add_fragment(f, index, next, w->open + (nearer ^ 1), walk->all + (nearer ^ 1));
 }
 
 /* Light of a tile in which order matters: depth by depth. */
 static void splat_ordered(const frame *f, const bin_list *list, uint32_t tile, window *w) {
-    float open_depth = f->lights[list->entries[0].fragment].depth;
-    additions all = {.waiting = 0};
-    for (int i = 0; i < list->count; ++i) {
+    depth_walk walk = {.number = -INFINITY, .state = SEEN};
+    for (int i = 0; i < list->count && walk.state != UNSEEN; ++i) {
         if (!(list->entries[i].tiles & tile)) continue;
-        uint32_t index = list->entries[i].fragment;
-        if (f->paper_rule) {
-            cover_with_fragment(f, index, w);
-            continue;
-        }
-        float depth = f->lights[index].depth;
-        if (is_beyond(f, depth, open_depth)) {
-            flush_additions(&all);
-            if (!close_depth(w)) return;
-            open_depth = depth;
-        }
-        add_fragment(f, index, w, &all);
+        add_behind(f, list->entries[i].fragment, w, &walk);
+        w->has_hidden |= is_hidden(f, list->entries[i].fragment);
     }
-    flush_additions(&all);
-    if (!f->paper_rule) close_depth(w);
+    if (walk.state == UNSEEN) return;
+    close_nearer(w, &walk);
+    close_nearer(w, &walk);
 }
 
-static void splat_unordered(const frame *f, const bin_list *list, uint32_t tiles,
-                            window *w) {
-    additions all = {.waiting = 0};
+/* The paper's rule: fragment by fragment. */
+static void splat_in_order(const frame *f, const bin_list *list, uint32_t tile, window *w) {
     for (int i = 0; i < list->count; ++i)
-        if (list->entries[i].tiles & tiles) add_fragment(f, list->entries[i].fragment, w, &all);
+        if (list->entries[i].tiles & tile) cover_with_fragment(f, list->entries[i].fragment, w);
+}
+
+/* Light of all fragments, or of the visible surface alone, regardless of order. */
+static void splat_unordered(const frame *f, const bin_list *list, uint32_t tiles,
+                            int with_hidden, window *w) {
+    additions all = {.waiting = 0};
+    for (int i = 0; i < list->count; ++i) {
+        uint32_t index = list->entries[i].fragment;
+        if (!(list->entries[i].tiles & tiles)) continue;
+        if (with_hidden || !is_hidden(f, index)) add_fragment(f, index, 1.0f, w->open, &all);
+    }
     flush_additions(&all);
-    gather_sizes(w);
+    gather_sizes(w->open);
 }

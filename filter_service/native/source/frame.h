@@ -25,7 +25,7 @@ typedef struct {
  * pixels of 2^r px, whose light is interpolated between their centers. */
 #define RESOLUTIONS 3
 
-/* A kernel for fragments of one level: texels of four pairs (red, green, blue, unused) of
+/* A kernel for fragments of one level: texels of four pairs (red, green, blue, mean) of
  * 15-bit weights at the near and far end.  weight = scale * (near * (1 - f) + far * f),
  * with the fraction f of the interval. */
 typedef struct {
@@ -50,10 +50,12 @@ typedef struct {
     uint16_t radius_px;
 } fragment;
 
-
 typedef struct {
-    float rgb[RGB];
+    float rgb[RGB];           /* times the coverage */
     float depth;              /* sort depth, smaller is nearer */
+    float strength;           /* of an edge of the visible surface, 0 to 1 */
+    float coverage;           /* 1 on the visible surface */
+    float excess;             /* light that missing coverage does not amplify */
 } fragment_light;
 
 enum { BOX_LEFT, BOX_RIGHT, BOX_TOP, BOX_BOTTOM };
@@ -70,7 +72,7 @@ typedef struct {
     uint8_t merged;           /* pixels that are part of squares */
 } block_info;
 
-/* A node kernel at one resolution: floats in fours (red, green, blue, 0), surrounded by
+/* A node kernel at one resolution: floats in fours (red, green, blue, mean), surrounded by
  * texels of zeros.  stride is 0 if no kernel needs it. */
 typedef struct {
     uint64_t first_texel;
@@ -119,6 +121,7 @@ typedef struct {
 
     float *dpt;               /* of each pixel; NOTHING_DPT in empty hidden pixels */
     float *position;          /* in layers */
+    float *block_light;       /* (block_rows, block_columns, 4): sum over pixels, and count */
     uint8_t *used;            /* (cells, intervals) */
     int64_t missing_count, clamped_count, bad_color_count;
 

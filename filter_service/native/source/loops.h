@@ -37,6 +37,7 @@ static void pixels(frame *f) {
 static void merge(frame *f) {
     f->fragment_count = f->merged_count = 0;
     f->farthest_px = 0;
+    pool_run(f->threads, f->block_rows, sum_block_row, f);
     for (int surface = 0; surface < f->surface_count; ++surface) {
         merge_job job = {f, surface};
         pool_run(f->threads, f->block_rows, merge_row, &job);

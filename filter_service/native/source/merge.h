@@ -14,18 +14,30 @@ typedef struct {
     float place;
     uint32_t kernel;
     int level, is_edge;
+    float strength, coverage;
 } origin;
 
+/* Mean over the square that starts at a pixel. */
+INLINE float square_mean(const float *pixels, int i, int level) {
+    float sum = 0.0f;
+    for (uint64_t left = square_pixels[level] << i; left; left &= left - 1)
+        sum += pixels[__builtin_ctzll(left)];
+    return sum / (float)(1 << 2 * level);
+}
+
 INLINE origin origin_of(const block *b, const block_squares *all, int i, int level) {
+    int is_edge = (b->edges & square_pixels[level] << i) != 0;
+    float strength = is_edge && b->surface == 0 ? square_mean(b->strength, i, level) : 0.0f;
+    float coverage = b->surface > 0 ? square_mean(b->coverage, i, level) : 1.0f;
     if (level == 0)
         return (origin){{b->rgb[0][i], b->rgb[1][i], b->rgb[2][i], b->dpt[i]},
-                        b->place[i], b->kernel[i], 0, (int)(b->edges >> i & 1)};
+                        b->place[i], b->kernel[i], 0, is_edge, strength, coverage};
     const square_row *s = &all->rows[level - 1][i / TILE_SIZE_PX >> level];
     int lane = i % TILE_SIZE_PX;
     return (origin){{lane_of(&s->mean[0], lane), lane_of(&s->mean[1], lane),
                      lane_of(&s->mean[2], lane), lane_of(&s->dpt, lane)},
-                    lane_of(&s->place, lane), all->kernel[i], level,
-                    (b->edges & square_pixels[level] << i) != 0};
+                    lane_of(&s->place, lane), all->kernel[i], level, is_edge, strength,
+                    coverage};
 }
 
 /* Sort depth; smaller is nearer. */
@@ -60,8 +72,11 @@ INLINE void write_fragment(const block *b, int i, const origin *from, uint32_t a
     float depth = sort_depth(f, x, y, from->color[3]);
     uint32_t state = from->kernel | (uint32_t)level << LEVEL_SHIFT
                      | (from->is_edge ? EDGE_BIT : 0u);
-    f->lights[at] =
-        (fragment_light){{from->color[0], from->color[1], from->color[2]}, depth};
+    float excess = 0.0f;
+    for (int c = 0; c < RGB; ++c)
+        excess += larger_float(from->color[c] - b->bright[c] * from->coverage, 0.0f);
+    f->lights[at] = (fragment_light){{from->color[0], from->color[1], from->color[2]},
+                                     depth, from->strength, from->coverage, excess / RGB};
     f->fragments[at] = (fragment){(uint16_t)x, (uint16_t)y, state,
                                   (uint16_t)(fraction * 65535.0f + 0.5f),
                                   (uint16_t)(shape->radius_px + beyond)};

@@ -4,12 +4,28 @@
 #include "frame.h"
 #include "vectors.h"
 
+/* Share of light, in each pixel, that missing coverage does not amplify: the excess. */
+INLINE f32x8 kept_light(const pixel_pair *sums) {
+    f32x8 lacking = larger8(all8(1.0f) - sums->coverage, all8(0.0f));
+    f32x8 kept = all8(1.0f);
+    for (int pixel = 0; pixel < 8; pixel += 4) {
+        f32x8 light = sums->light;
+        float mean = (light[pixel] + light[pixel + 1] + light[pixel + 2]) * (1.0f / RGB);
+        float excess = sums->coverage[pixel + 3];
+        float share = mean > 0.0f ? smaller_float(excess / mean, 1.0f) : 0.0f;
+        for (int i = pixel; i < pixel + 4; ++i) kept[i] -= share * lacking[i];
+    }
+    return kept;
+}
+
 /* Light of two pixels over their coverage; without coverage, the pixels' own light.  Pixels
  * before `left` and from `right` on are outside the image. */
 INLINE f32x8 seen_light(const frame *f, const pixel_pair *sums, int x, int y, int left,
                         int right) {
     f32x8 least = all8(MIN_COVERAGE);
     f32x8 light = sums->light / larger8(sums->coverage, least);
+    if (sums->coverage[3] + sums->coverage[7] > 0.0f && !f->paper_rule)
+        light *= kept_light(sums);
     i32x8 lacks = (sums->coverage < least) & (i32x8){-1, -1, -1, 0, -1, -1, -1, 0};
     if (!any8(lacks)) return light;
     for (int i = 0; i < 8; ++i) {
@@ -19,6 +35,19 @@ INLINE f32x8 seen_light(const frame *f, const pixel_pair *sums, int x, int y, in
         light[i] = own[i % 4];
     }
     return light;
+}
+
+/* Light of two pixels by depths, as far as light of edges reaches them, else of all depths at
+ * once. */
+INLINE f32x8 mixed_light(const frame *f, const pixel_pair *near, const pixel_pair *total, int x,
+                         int y, int left, int right) {
+    f32x8 by_depth = seen_light(f, near, x, y, left, right);
+    float first = smaller_float(total->light[3] * (1.0f / EDGE_MIX_COVERAGE), 1.0f);
+    float second = smaller_float(total->light[7] * (1.0f / EDGE_MIX_COVERAGE), 1.0f);
+    if (smaller_float(first, second) >= 1.0f) return by_depth;
+    f32x8 all = seen_light(f, total, x, y, left, right);
+    f32x8 share = {first, first, first, first, second, second, second, second};
+    return all + share * (by_depth - all);
 }
 
 INLINE size_t pixel_bytes(int kind) {
@@ -46,8 +75,10 @@ INLINE void encode_pair(int kind, f32x8 light, uint8_t *to) {
     }
 }
 
-/* Writes the pixels of a window, in one kind of encoding. */
-INLINE void write_window_as(const frame *f, int kind, const window *w, const pixel_pair *sums) {
+/* Writes the pixels of a window, in one kind of encoding: of sums by depths and their total,
+ * or of one sum (`total` is NULL). */
+INLINE void write_window_as(const frame *f, int kind, const window *w, const pixel_pair *sums,
+                            const pixel_pair *total) {
     int left = larger_int(w->x0, f->border_px);
     int right = smaller_int(w->x0 + w->width, f->border_px + f->image_width);
     int bottom = smaller_int(w->y0 + w->height, f->border_px + f->image_height);
@@ -55,9 +86,12 @@ INLINE void write_window_as(const frame *f, int kind, const window *w, const pix
     size_t size = pixel_bytes(kind);
     uint8_t row[BIN_WIDTH * RGB * sizeof(float)];
     for (int y = larger_int(w->y0, f->border_px); y < bottom; ++y) {
-        const pixel_pair *from = sums + (y - w->y0) * PAIRS_ACROSS;
         for (int x = 0; x < w->width; x += 2) {
-            f32x8 light = seen_light(f, from + x / 2, w->x0 + x, y, left, right);
+            int pair = (y - w->y0) * PAIRS_ACROSS + x / 2;
+            f32x8 light = total == NULL
+                              ? seen_light(f, sums + pair, w->x0 + x, y, left, right)
+                              : mixed_light(f, sums + pair, total + pair, w->x0 + x, y, left,
+                                            right);
             encode_pair(kind, light, row + size * (size_t)x);
         }
         size_t to = (size_t)(y - f->border_px) * (size_t)f->image_width
@@ -67,8 +101,9 @@ INLINE void write_window_as(const frame *f, int kind, const window *w, const pix
     }
 }
 
-static void write_window(const frame *f, const window *w, const pixel_pair *sums) {
-    if (f->output_kind == COLOR_SRGB8) write_window_as(f, COLOR_SRGB8, w, sums);
-    else if (f->output_kind == COLOR_LINEAR) write_window_as(f, COLOR_LINEAR, w, sums);
-    else write_window_as(f, COLOR_HALF, w, sums);
+static void write_window(const frame *f, const window *w, const pixel_pair *sums,
+                         const pixel_pair *total) {
+    if (f->output_kind == COLOR_SRGB8) write_window_as(f, COLOR_SRGB8, w, sums, total);
+    else if (f->output_kind == COLOR_LINEAR) write_window_as(f, COLOR_LINEAR, w, sums, total);
+    else write_window_as(f, COLOR_HALF, w, sums, total);
 }

@@ -65,13 +65,19 @@ INLINE void row_vergences(const frame *f, const float *depth_m, int y, float *dp
     }
 }
 
+/* Share of a hidden pixel that its distance behind the visible surface lets appear. */
+INLINE float hidden_coverage(const frame *f, float seen_dpt, float dpt) {
+    float behind_px = (seen_dpt - dpt) * f->blur_px_per_dpt;
+    float beyond = behind_px * (1.0f / DISCONTINUITY_PX) - 1.0f;
+    return smaller_float(larger_float(beyond, 0.0f), 1.0f);
+}
+
 /* Empties a row of the hidden surface where there is no depth, or the blur is that of the
  * surface in front of it. */
 INLINE void hide_row(const frame *f, const float *depth_m, const float *seen_dpt,
                      float *dpt) {
     for (int x = 0; x < f->width; ++x) {
-        float behind_px = (seen_dpt[x] - dpt[x]) * f->blur_px_per_dpt;
-        int holds = depth_m[x] > 0.0f && behind_px > DISCONTINUITY_PX;
+        int holds = depth_m[x] > 0.0f && hidden_coverage(f, seen_dpt[x], dpt[x]) > 0.0f;
         dpt[x] = holds ? dpt[x] : NOTHING_DPT;
     }
 }
@@ -160,17 +166,16 @@ static void pixel_row(void *argument, int y, int thread) {
             missing += !holds && in_image && s == 0;
         }
         if (in_image) bad += bad_colors(f, s, first, depth_m);
+        for (int x = 0; x < f->width; ++x) {
+            float kept = dpt[x] < f->vergence_low_dpt ? f->vergence_low_dpt : dpt[x];
+            dpt[x] = kept > f->vergence_high_dpt ? f->vergence_high_dpt : kept;
+        }
     }
     for (int s = f->surface_count - 1; s > 0; --s)
         hide_row(f, f->depth_m[s] + first, f->dpt + first,
                  f->dpt + (size_t)s * pixels + first);
     for (int s = 0; s < f->surface_count; ++s) {
         float *dpt = f->dpt + (size_t)s * pixels + first;
-        for (int x = 0; x < f->width; ++x) {
-            float kept = dpt[x] < f->vergence_low_dpt ? f->vergence_low_dpt : dpt[x];
-            kept = kept > f->vergence_high_dpt ? f->vergence_high_dpt : kept;
-            dpt[x] = dpt[x] < 0.0f ? NOTHING_DPT : kept;
-        }
         row_positions(f, dpt, y, change_dpt, f->position + (size_t)s * pixels + first);
     }
     if (clamped) __atomic_fetch_add(&f->clamped_count, clamped, __ATOMIC_RELAXED);

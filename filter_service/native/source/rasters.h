@@ -3,7 +3,8 @@
 #include "frame.h"
 #include "vectors.h"
 
-/* Sums of two adjacent pixels: red, green, blue and an unused lane of each. */
+/* Sums of two adjacent pixels: red, green, blue and a fourth lane of each, which is the
+ * strength of edges with the light, and the excess light with the coverage. */
 typedef struct { f32x8 light, coverage; } pixel_pair;
 
 #define PAIRS_ACROSS (BIN_WIDTH / 2)
@@ -17,11 +18,16 @@ typedef struct {
     pixel_pair *pairs;
 } raster;
 
-/* Pixels of a bin or a tile: of the open depth in each size, and of the nearer depths. */
+/* Light of one group of depths in each size. */
+typedef struct { raster sizes[RESOLUTIONS]; } depth_group;
+
+/* Pixels of a bin or a tile, in rows of PAIRS_ACROSS. */
 typedef struct {
     int x0, y0, width, height;
-    raster open[RESOLUTIONS];
-    pixel_pair *near;           /* rows of PAIRS_ACROSS */
+    depth_group open[2];        /* two consecutive groups; without order, only the first */
+    pixel_pair *near;           /* light of closed groups, each behind those before it */
+    pixel_pair *total;          /* light of closed groups, regardless of order */
+    int has_hidden;             /* whether it includes light of a hidden surface */
 } window;
 
 INLINE void clear_pairs(pixel_pair *pairs, int stride, int width, int height) {
@@ -34,20 +40,41 @@ INLINE void clear_raster(raster *own) {
     own->is_lit = 0;
 }
 
-/* Sums of a bin in all sizes; a tile uses the first elements of each. */
+/* Sums of a group of depths in all sizes; a tile uses the first elements of each. */
 typedef struct {
-    pixel_pair near[BIN_HEIGHT * PAIRS_ACROSS];
-    pixel_pair open[BIN_HEIGHT * PAIRS_ACROSS];
+    pixel_pair whole[BIN_HEIGHT * PAIRS_ACROSS];
     pixel_pair half[(BIN_HEIGHT / 2 + 2) * (PAIRS_ACROSS / 2 + 1)];
     pixel_pair quarter[(BIN_HEIGHT / 4 + 2) * (PAIRS_ACROSS / 4 + 1)];
+} group_sums;
+
+/* Sums of a bin. */
+typedef struct {
+    pixel_pair near[BIN_HEIGHT * PAIRS_ACROSS];
+    pixel_pair total[BIN_HEIGHT * PAIRS_ACROSS];
+    group_sums open[2];
 } bin_sums;
 
-INLINE window open_window(int x0, int y0, int width, int height, bin_sums *s) {
-    window w = {x0, y0, width, height, {{x0, y0, width, height, PAIRS_ACROSS, 0, s->open}}, s->near};
-    pixel_pair *coarse[RESOLUTIONS] = {s->open, s->half, s->quarter};
+INLINE depth_group open_group(int x0, int y0, int width, int height, group_sums *s) {
+    depth_group group = {{{x0, y0, width, height, PAIRS_ACROSS, 0, s->whole}}};
+    pixel_pair *coarse[RESOLUTIONS] = {s->whole, s->half, s->quarter};
     for (int r = 1; r < RESOLUTIONS; ++r)
-        w.open[r] = (raster){(x0 >> r) - 1, (y0 >> r) - 1, (width >> r) + 2, (height >> r) + 2,
-                             ((width >> r) + 2) / 2, 0, coarse[r]};
-    for (int r = 0; r < RESOLUTIONS; ++r) clear_raster(w.open + r);
+        group.sizes[r] = (raster){(x0 >> r) - 1, (y0 >> r) - 1, (width >> r) + 2,
+                                  (height >> r) + 2, ((width >> r) + 2) / 2, 0, coarse[r]};
+    for (int r = 0; r < RESOLUTIONS; ++r) clear_raster(group.sizes + r);
+    return group;
+}
+
+/* Opens a window with one group of depths. */
+INLINE window open_window(int x0, int y0, int width, int height, bin_sums *s) {
+    window w = {.x0 = x0, .y0 = y0, .width = width, .height = height,
+                .near = s->near, .total = s->total};
+    w.open[0] = open_group(x0, y0, width, height, s->open);
     return w;
+}
+
+/* Prepares a window for groups of depths in order. */
+INLINE void open_order(window *w, bin_sums *s) {
+    w->open[1] = open_group(w->x0, w->y0, w->width, w->height, s->open + 1);
+    clear_pairs(w->near, PAIRS_ACROSS, w->width, w->height);
+    clear_pairs(w->total, PAIRS_ACROSS, w->width, w->height);
 }

@@ -108,6 +108,10 @@ static void blend_channel(const frame *f, const uint32_t *words, int r, reach bo
     }
 }
 
+INLINE f32x4 with_mean(float red, float green, float blue) {
+    return (f32x4){red, green, blue, (red + green + blue) * (1.0f / 3.0f)};
+}
+
 /* Item of the first loop: blends one recipe in one resolution. */
 static void blend_recipe(void *argument, int item, int thread) {
     const frame *f = argument;
@@ -129,8 +133,8 @@ static void blend_recipe(void *argument, int item, int thread) {
     for (int y = 0; y < height; ++y, row += 4 * image->stride) {
         const float *red = scratch + (size_t)y * (size_t)stride;
         for (int x = 0; x < width; ++x)
-            store4(row + 4 * x, (f32x4){red[x], red[plane + (size_t)x],
-                                        red[2 * plane + (size_t)x], 0.0f});
+            store4(row + 4 * x, with_mean(red[x], red[plane + (size_t)x],
+                                          red[2 * plane + (size_t)x]));
         memset(row + 4 * width, 0, sizeof(float) * 4 * PAD_TEXELS);
     }
     memset(row, 0, sizeof(float) * 4 * PAD_TEXELS * (size_t)image->stride);

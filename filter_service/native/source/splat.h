@@ -10,18 +10,39 @@ typedef struct {
     bin_list *lists;          /* one per thread */
 } splat_job;
 
+/* Returns whether some pixel of a window takes less than all of its light by depths. */
+static int is_mixed(const window *w) {
+    for (int y = 0; y < w->height; ++y)
+        for (int x = 0; x < w->width / 2; ++x) {
+            f32x8 light = w->total[y * PAIRS_ACROSS + x].light;
+            if (smaller_float(light[3], light[7]) < EDGE_MIX_COVERAGE) return 1;
+        }
+    return 0;
+}
+
 /* Splats a bin, or one tile of it, in which order matters everywhere or nowhere. */
 static void splat_window(const frame *f, const bin_list *list, uint32_t tiles, int x0, int y0,
                          int width, int height, bin_sums *s) {
     window w = open_window(x0, y0, width, height, s);
-    if (list->ordered & tiles) {
-        clear_pairs(w.near, PAIRS_ACROSS, width, height);
-        splat_ordered(f, list, tiles, &w);
-        write_window(f, &w, w.near);
-    } else {
-        splat_unordered(f, list, tiles, &w);
-        write_window(f, &w, w.open[0].pairs);
+    if (!(list->ordered & tiles)) {
+        splat_unordered(f, list, tiles, 1, &w);
+        write_window(f, &w, w.open[0].sizes[0].pairs, NULL);
+        return;
     }
+    open_order(&w, s);
+    if (f->paper_rule) {
+        splat_in_order(f, list, tiles, &w);
+        write_window(f, &w, w.near, NULL);
+        return;
+    }
+    splat_ordered(f, list, tiles, &w);
+    if (w.has_hidden && is_mixed(&w)) {
+        /* Without order, the light of the hidden surface must not count. */
+        w.open[0] = open_group(x0, y0, width, height, s->open);
+        splat_unordered(f, list, tiles, 0, &w);
+        w.total = w.open[0].sizes[0].pairs;
+    }
+    write_window(f, &w, w.near, w.total);
 }
 
 /* Item: one bin. */

@@ -419,7 +419,9 @@ class FrameRecord:
         c.kernel_count = plan.kernels.count
         reach_px = float(plan.kernels.reach_px.max())
         c.largest_reach_px = reach_px + REACH_MARGIN_PX + COARSE_MARGIN_PX
-        n_blocks = c.surface_count * c.block_columns * c.block_rows
+        n_blocks = c.block_columns * c.block_rows
+        c.block_light = self._buffer("block_light", 4 * n_blocks, np.float32)
+        n_blocks *= c.surface_count
         c.fragments = self._buffer("fragments", n_blocks * BLOCK_PIXELS, FRAGMENT)
         c.lights = self._buffer("lights", n_blocks * BLOCK_PIXELS, FRAGMENT_LIGHT)
         n_places = n_blocks * BLOCK_PIXELS + BOX_PADDING_COUNT

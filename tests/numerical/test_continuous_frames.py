@@ -1,0 +1,103 @@
+"""Frames that change continuously with depth, and lamps beside edges."""
+
+import numpy as np
+import pytest
+
+from filter_service.constants import DISCONTINUITY_PX
+from filter_service.rgbd_view import RgbdView
+from tests.numerical.synthetic import Bench, texture
+
+EMMETROPE = {"kind": "prescription", "sphere_dpt": 0.0}
+PURE = {"diffraction": False, "chromatic": False}
+WIDTH, HEIGHT = 64, 48
+STATE = {"pupil_diameter_mm": 4.0, "focus_dpt": 0.5}
+STEP_RATIO = 2e-3
+"""Relative change of a step of depth; light changes by less than half of this."""
+
+Y, X = np.mgrid[:HEIGHT, :WIDTH]
+DISC = np.hypot(X - WIDTH // 2, Y - HEIGHT // 2) < 12
+BAR = abs(X - 14) < 3
+
+
+@pytest.fixture(scope="module")
+def bench(engine):
+    return Bench(
+        engine,
+        EMMETROPE,
+        width_px=WIDTH,
+        height_px=HEIGHT,
+        vertical_fov_deg=4.0,
+        **PURE,
+    )
+
+
+def change_across(bench, frame):
+    """Return the largest change of a frame when a step of depth becomes an edge.
+
+    ``frame`` takes the step in diopters.
+    """
+    edge_dpt = DISCONTINUITY_PX / bench.layers(**STATE).blur_px_per_dpt
+    below, above = (
+        frame(edge_dpt * ratio)
+        for ratio in (1.0 - STEP_RATIO / 2.0, 1.0 + STEP_RATIO / 2.0)
+    )
+    return np.abs(above.astype(float) - below).max()
+
+
+@pytest.mark.parametrize("has_bar", [False, True])
+def test_a_step_that_becomes_an_edge_changes_no_pixel_at_once(bench, rng, has_bar):
+    """Alone, and beside a bar whose light makes order matter everywhere."""
+    fine = texture(rng, HEIGHT, WIDTH, cell_px=3)
+    color = np.where(DISC[..., None], 0.6 + 0.4 * fine, 0.2 * fine)
+    near_dpt = 1.5
+
+    def frame(step_dpt):
+        distance_dpt = np.where(DISC, near_dpt, near_dpt - step_dpt)
+        if has_bar:
+            distance_dpt[BAR] = 4.0
+        depth_m = (1.0 / distance_dpt).astype(np.float32)
+        view = bench.view(color.astype(np.float32), depth_m, "radial")
+        return bench.render(view, **STATE, merge=False).color
+
+    assert change_across(bench, frame) < 1e-3
+
+
+def test_a_hidden_surface_appears_gradually_behind_the_visible_one(bench, rng):
+    color = np.zeros((HEIGHT, WIDTH, 3), np.float32)
+    hidden_color = 0.5 + 0.5 * texture(rng, HEIGHT, WIDTH)
+    distance_dpt = np.where(DISC, 3.0, 1.0).astype(np.float32)
+
+    def frame(step_dpt):
+        view = RgbdView(
+            color,
+            np.float32(1.0) / distance_dpt,
+            bench.tangents,
+            "radial",
+            hidden_color=hidden_color,
+            hidden_depth_m=(1.0 / (distance_dpt - step_dpt)).astype(np.float32),
+        )
+        return bench.render(view, **STATE, merge=False).color
+
+    assert change_across(bench, frame) < 1e-3
+
+
+@pytest.mark.parametrize("light", [1.0, 50.0])
+@pytest.mark.parametrize("is_near", [False, True])
+def test_a_lamp_beside_an_edge_has_the_energy_of_its_visible_part(
+    bench, light, is_near
+):
+    """A lamp on the far surface, focused on the near one; and the reverse."""
+    near = X < WIDTH // 2
+    depth_m = np.where(near, 1.0 / 2.5, 1.0 / 0.5).astype(np.float32)
+    state = STATE | {"focus_dpt": 0.5 if is_near else 2.5}
+    for distance_px in (1, 2):
+        column = WIDTH // 2 + (-distance_px if is_near else distance_px - 1)
+        color = np.zeros((HEIGHT, WIDTH, 3), np.float32)
+        color[HEIGHT // 2, column] = light
+        beside, alone = (
+            bench.render(bench.view(color, d, "radial"), **state).color.astype(float)
+            for d in (depth_m, depth_m[HEIGHT // 2, column])
+        )
+        visible = alone if is_near else alone[:, WIDTH // 2 :]
+        assert is_near or visible.sum() < 0.99 * alone.sum()
+        assert beside.sum() == pytest.approx(visible.sum(), rel=0.02)
