@@ -32,7 +32,7 @@ FINE_PARTS = 1
 """Parts of each interval between the field nodes of an eye's plan, by mode, and added
 parts with tolerance "fine"."""
 
-LAYER_STEP_RATIO = {"on-axis": 0.1, "quality": 0.1, "dynamic": 0.2}
+LAYER_STEP_RATIO = {"on-axis": 0.2, "quality": 0.3, "dynamic": 0.4}
 """Steps between layers relative to the default."""
 
 RAYS_FROM_DB = {"on-axis": 64.0, "quality": 58.0, "dynamic": 54.0}

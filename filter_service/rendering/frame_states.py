@@ -7,7 +7,7 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple, Protocol
+from typing import Any, ClassVar, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -190,6 +190,9 @@ class FrameStore:
     store: PsfStore
     image: ImageCells
 
+    can_blend: ClassVar[bool] = False
+    """Whether the engine blends the kernels of cells, see `image_cells`."""
+
     def __post_init__(self) -> None:
         """Begin without cached states."""
         self.is_released = False
@@ -330,7 +333,13 @@ class FrameStore:
         spec = self.store.spec
         if gaze_deg == spec.settings.gaze_deg or not spec.follows_field:
             return self.image
-        return image_cells(spec, self.store.plan, gaze_deg, node_scale=self.node_scale)
+        return image_cells(
+            spec,
+            self.store.plan,
+            gaze_deg,
+            node_scale=self.node_scale,
+            can_blend=self.can_blend,
+        )
 
     def layers(
         self,
@@ -376,6 +385,7 @@ class FrameStore:
                         gaze_deg,
                         cell_px=cell_px,
                         node_scale=self.node_scale,
+                        can_blend=self.can_blend,
                     ),
                 )
         return self._image[1]

@@ -90,8 +90,12 @@ TEXELS_PER_PIXEL = 10.0
 the cells become twice as wide to save memory.  With 16 bytes per texel, the limit is
 150 MB at 1280x720."""
 
-EXACT_CELL_DEG = {"loose": 0.5, "normal": 0.5, "fine": 0.25}
-EXACT_TEXELS_PER_PIXEL = 80.0
+EXACT_CELL_DEG = {"loose": 1.0, "normal": 1.0, "fine": 0.5}
+"""The same for frames with a render tolerance of 0, whose pixels blend the kernels of
+cells."""
+
+EXACT_TEXELS = 48_000_000
+"""Largest number of texels of the level-0 kernels of such a frame: 770 MB."""
 
 MIN_CELL_PX = 4
 MAX_CELL_PX = 256
@@ -119,6 +123,9 @@ class ImageCells:
         Maps to the pixels of the nodes' stored kernels.
     corner_h_deg, corner_v_deg : (rows + 1, columns + 1)
         Field directions of the cells' corners.
+    centers_px : (columns,), (rows,)
+        Positions of the cells' centers if pixels blend the kernels of cells; empty
+        otherwise.
     """
 
     cell_px: int
@@ -128,6 +135,25 @@ class ImageCells:
     maps: CellMaps
     corner_h_deg: NDArray[np.float64]
     corner_v_deg: NDArray[np.float64]
+    centers_px: tuple[NDArray[np.float64], ...] = ()
+
+    @property
+    def blends(self) -> bool:
+        """Whether each pixel blends the kernels of the cells around it."""
+        return bool(self.centers_px)
+
+    def blending(
+        self, axis: int, places_px: NDArray[np.int64]
+    ) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
+        """Return the cell before each of some pixels (n,), and the share of the next.
+
+        Parameters
+        ----------
+        axis : int
+            0 for columns, 1 for rows.
+        """
+        first, _, share = bracket_axis(self.centers_px[axis], places_px + 0.5)
+        return first.astype(np.int32), share.astype(np.float32)
 
     @property
     def count(self) -> int:
@@ -142,6 +168,7 @@ def image_cells(
     *,
     cell_px: int | None = None,
     node_scale: NDArray[np.float64] | None = None,
+    can_blend: bool = False,
 ) -> ImageCells:
     """Return the cells of the spec's camera and their field nodes.
 
@@ -153,6 +180,9 @@ def image_cells(
         Edge of the cells, if larger than the default; their kernels need less memory.
     node_scale : (n_fields, 2, 2), optional
         `stored_scale` of the plan, if already computed.
+    can_blend : bool
+        Whether the engine can blend the kernels of cells, as frames with a render
+        tolerance of 0 require; if it cannot, their cells are smaller.
     """
     if not spec.follows_field:
         return ImageCells(
@@ -165,19 +195,17 @@ def image_cells(
             corner_v_deg=np.zeros((2, 2)),
         )
     gaze_deg = spec.settings.gaze_deg if gaze_deg is None else gaze_deg
-    cell_px = cell_px or default_cell_px(spec)
+    blends = can_blend and spec.is_exact
+    cell_px = cell_px or default_cell_px(spec, blends=blends)
     camera = spec.camera
     grid = (-(-camera.width_px // cell_px), -(-camera.height_px // cell_px))
-    x_px, y_px = np.meshgrid(
-        *((np.arange(n) + 0.5) * cell_px for n in grid), indexing="xy"
-    )
     # The last cells may extend beyond the image.
-    h_deg, v_deg = field_deg(
-        camera,
-        np.minimum(x_px, camera.width_px).ravel(),
-        np.minimum(y_px, camera.height_px).ravel(),
-        gaze_deg=gaze_deg,
+    centers_px = tuple(
+        np.minimum((np.arange(n) + 0.5) * cell_px, size)
+        for n, size in zip(grid, (camera.width_px, camera.height_px), strict=True)
     )
+    x_px, y_px = np.meshgrid(*centers_px, indexing="xy")
+    h_deg, v_deg = field_deg(camera, x_px.ravel(), y_px.ravel(), gaze_deg=gaze_deg)
     nodes, weight_ratio = _field_nodes(plan, h_deg, v_deg)
     scale = spec.pixel_from_mrad(h_deg, v_deg, gaze_deg=gaze_deg)
     corner_h_deg, corner_v_deg = field_deg(
@@ -196,6 +224,7 @@ def image_cells(
         maps=CellMaps(_node_from_cell(node_scale[nodes], scale)),
         corner_h_deg=corner_h_deg,
         corner_v_deg=corner_v_deg,
+        centers_px=centers_px if blends else (),
     )
 
 
@@ -236,11 +265,12 @@ def check_texels(n_texels: int, image: ImageCells, spec: GridSpec) -> None:
     """
     if not can_coarsen(image):
         return
-    per_pixel = EXACT_TEXELS_PER_PIXEL if spec.is_exact else TEXELS_PER_PIXEL
-    if n_texels > per_pixel * spec.camera.pixel_count:
+    allowed = TEXELS_PER_PIXEL * spec.camera.pixel_count
+    if spec.is_exact:
+        allowed = max(allowed, EXACT_TEXELS)
+    if n_texels > allowed:
         raise KernelsTooLarge(
-            f"the frame's kernels have {n_texels} texels; expected at most "
-            f"{per_pixel:g} per pixel"
+            f"the frame's kernels have {n_texels} texels; expected at most {allowed:g}"
         )
 
 
@@ -257,11 +287,13 @@ def _node_from_cell(
     return upward * np.array([[1.0, -1.0], [-1.0, 1.0]])
 
 
-def default_cell_px(spec: GridSpec) -> int:
+def default_cell_px(spec: GridSpec, *, blends: bool = False) -> int:
     """Return the edge of cells unless their kernels need too much memory."""
     pixel_deg = math.degrees(min(spec.pixel_pitch_mrad) / 1000.0)
     cell_deg, least_px = CELL_DEG[spec.settings.mode], MIN_CELL_PX
     if spec.is_exact:
         cell_deg, least_px = EXACT_CELL_DEG[spec.settings.tolerance], 1
+        if not blends:
+            cell_deg /= 4.0
     power = math.floor(math.log2(max(cell_deg / pixel_deg, 1.0)))
     return min(max(2**power, least_px), MAX_CELL_PX)

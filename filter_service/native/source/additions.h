@@ -12,7 +12,7 @@ typedef struct {
 
 /* Fragments of the hidden surface follow those of the visible one. */
 INLINE int is_hidden(const frame *f, uint32_t index) {
-    return index >= (uint32_t)(f->block_rows * f->block_columns * BLOCK_PIXELS);
+    return index >= (uint32_t)(f->block_rows * f->block_columns * f->block_slots);
 }
 
 INLINE const level_image *image_of(const frame *f, const fragment *one) {

@@ -117,6 +117,12 @@ typedef struct {
     const float *corner_dpt;  /* change of defocus at the corners of the cells */
     const int32_t *column_cell;              /* of each column of the frame */
     const float *column_share;               /* position within it, 0 to 1 */
+    /* If pixels blend the kernels of the cells around them: the first cell of each column
+     * and row of the frame, and the share of the next one.  Otherwise NULL. */
+    const int32_t *blend_column, *blend_row;
+    const float *blend_across, *blend_down;
+    int32_t block_slots;      /* fragments that a block has room for */
+    int32_t spare;
     float *row_scratch;                      /* cell_columns + 1 for each thread */
 
     float *dpt;               /* of each pixel; NOTHING_DPT in empty hidden pixels */
@@ -135,7 +141,7 @@ typedef struct {
     float tolerance;          /* of merging, relative to the default */
     float gaze_direction[3];  /* right, up, forward; zero: merging is the same everywhere */
     float largest_reach_px;
-    fragment *fragments;      /* room for 64 per block; no gaps in a row of blocks */
+    fragment *fragments;      /* block_slots per block; no gaps in a row of blocks */
     fragment_light *lights;
     int16_t *boxes[4];        /* first and last columns and rows that fragments light */
     block_info *blocks;

@@ -107,6 +107,23 @@ static int edge_in_reach(const frame *f, int column, int row) {
     return 0;
 }
 
+/* Writes pixel i of a block as one fragment for each of the cells that it blends. */
+INLINE void write_blended(const block *b, int i, const origin *pixel, block_info *info) {
+    const frame *f = b->f;
+    cell_part parts[FIELD_CORNERS];
+    int count = blended_cells(f, b->x0 + i % TILE_SIZE_PX, b->y0 + i / TILE_SIZE_PX, parts);
+    int interval = position_interval(f, pixel->place);
+    for (int j = 0; j < count; ++j) {
+        origin own = *pixel;
+        float share = parts[j].share;
+        own.kernel = f->kernel_of[parts[j].cell * f->interval_count + interval];
+        own.color *= (f32x4){share, share, share, 1.0f};
+        own.coverage *= share;
+        own.strength *= share;
+        write_fragment(b, i, &own, info->end++);
+    }
+}
+
 /* Removes squares that are part of larger ones; returns the pixels that are part of none. */
 INLINE uint64_t largest_squares(const block *b, block_squares *all) {
     uint64_t pixels = b->held;
@@ -129,10 +146,14 @@ static void write_block(const block *b, block_squares *all, block_info *info) {
         int level = 0;
         while (level < MAX_LEVEL && !((level ? all->merged[level] : pixels) >> i & 1)) ++level;
         origin from = origin_of(b, all, i, level);
-        write_fragment(b, i, &from, info->end);
-        const fragment *one = b->f->fragments + info->end++;
-        if (one->radius_px > info->radius_px) info->radius_px = one->radius_px;
-        info->has_edge |= (one->state & EDGE_BIT) != 0;
+        uint32_t first = info->end;
+        if (level == 0 && b->f->blend_column != NULL) write_blended(b, i, &from, info);
+        else write_fragment(b, i, &from, info->end++);
+        for (; first < info->end; ++first) {
+            const fragment *one = b->f->fragments + first;
+            if (one->radius_px > info->radius_px) info->radius_px = one->radius_px;
+            info->has_edge |= (one->state & EDGE_BIT) != 0;
+        }
         if (level > 0) info->merged = (uint8_t)(info->merged + (1 << 2 * level));
     }
 }
@@ -163,7 +184,7 @@ static void merge_row(void *argument, int row, int thread) {
     int64_t merged = 0;
     int32_t farthest_px = 0;
     int line = (job->surface * f->block_rows + row) * f->block_columns;
-    uint32_t first = (uint32_t)line * BLOCK_PIXELS;
+    uint32_t first = (uint32_t)line * (uint32_t)f->block_slots;
     uint32_t at = first;
     for (int column = 0; column < f->block_columns; ++column) {
         block_info *info = f->blocks + line + column;

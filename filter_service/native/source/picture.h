@@ -4,9 +4,10 @@
 #include "frame.h"
 #include "vectors.h"
 
-/* Share of light, in each pixel, that missing coverage does not amplify: the excess. */
+/* Light of each pixel relative to its light over coverage: coverage changes the excess
+ * neither where it is missing, nor where kernels of different shape add up to more than 1. */
 INLINE f32x8 kept_light(const pixel_pair *sums) {
-    f32x8 lacking = larger8(all8(1.0f) - sums->coverage, all8(0.0f));
+    f32x8 lacking = all8(1.0f) - sums->coverage;
     f32x8 kept = all8(1.0f);
     for (int pixel = 0; pixel < 8; pixel += 4) {
         f32x8 light = sums->light;

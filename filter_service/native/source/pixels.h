@@ -93,6 +93,35 @@ INLINE void row_changes(const frame *f, int y, float *change_dpt) {
         change_dpt[column] = above[column] + down * (below[column] - above[column]);
 }
 
+/* Cells whose kernels a pixel reads, and their shares; returns their number.  Pixels that
+ * blend read the corners of a triangle of cell centers. */
+typedef struct {
+    int cell;
+    float share;
+} cell_part;
+
+INLINE int blended_cells(const frame *f, int x, int y, cell_part *parts) {
+    int columns = f->cell_columns;
+    int first = f->blend_row[y] * columns + f->blend_column[x];
+    float across = f->blend_across[x], down = f->blend_down[y];
+    float low = smaller_float(across, down), high = larger_float(across, down);
+    cell_part corners[FIELD_CORNERS] = {{first, 1.0f - high},
+                                        {first + (across >= down ? 1 : columns), high - low},
+                                        {first + columns + 1, low}};
+    int count = 0;
+    for (int j = 0; j < FIELD_CORNERS; ++j)
+        if (corners[j].share > 0.0f) parts[count++] = corners[j];
+    return count;
+}
+
+/* Marks the pairs of a pixel that blends cells. */
+INLINE void note_blended(const frame *f, int x, int y, float position) {
+    cell_part parts[FIELD_CORNERS];
+    int interval = position_interval(f, position);
+    for (int j = blended_cells(f, x, y, parts); j-- > 0;)
+        note_use(f->used + parts[j].cell * f->interval_count + interval);
+}
+
 /* Computes positions and used pairs of a row of a surface from its clamped vergences. */
 static void row_positions(const frame *f, const float *dpt, int y, float *change_dpt,
                           float *position) {
@@ -114,6 +143,10 @@ static void row_positions(const frame *f, const float *dpt, int y, float *change
             change = left + f->column_share[x] * (change_dpt[column + 1] - left);
         }
         position[x] = layer_position(f, dpt[x] + change, &found);
+        if (f->blend_column != NULL) {
+            note_blended(f, x, y, position[x]);
+            continue;
+        }
         int pair = (first_cell + column) * f->interval_count + position_interval(f, position[x]);
         if (pair != noted) note_use(f->used + pair);
         noted = pair;

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from filter_service.constants import (
+    FIELD_CORNERS,
     MAX_LEVEL,
     MIN_BLUR_RANGE,
     MIN_SPREAD_PX,
@@ -88,8 +89,11 @@ class NativeStore(FrameStore):
         Kernels at each resolution; `sync` adds new ones.
     """
 
+    can_blend = True
+
     def __init__(self, store: PsfStore) -> None:
-        super().__init__(store, image_cells(store.spec, store.plan))
+        cells = image_cells(store.spec, store.plan, can_blend=self.can_blend)
+        super().__init__(store, cells)
         self._psf_numbers = np.zeros(0, np.uint32)
         self._reset()
         _ = store.defocus  # computed here and not by the first frame
@@ -407,9 +411,28 @@ class FrameRecord:
             c.column_cell = self._pointer_to(cell.astype(np.int32))
             share = (place + np.float32(0.5)) / np.float32(image.cell_px)
             c.column_share = self._pointer_to(share.astype(np.float32))
+        c.block_slots = BLOCK_PIXELS
+        if image.blends:
+            c.block_slots *= FIELD_CORNERS
+            for axis, names in enumerate(
+                (("blend_column", "blend_across"), ("blend_row", "blend_down"))
+            ):
+                first, share = self._blending(image, axis)
+                setattr(c, names[0], self._pointer_to(first))
+                setattr(c, names[1], self._pointer_to(share))
         used = np.zeros((image.count, c.interval_count), np.bool_)
         c.used = self._pointer_to(used)
         return used
+
+    def _blending(
+        self, image: ImageCells, axis: int
+    ) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
+        """Return the first cell (n,) of columns or rows, and the share of the next."""
+        c = self.c
+        size = (c.width, c.height)[axis]
+        image_size = (c.image_width, c.image_height)[axis]
+        places = np.clip(np.arange(size) - c.border_px, 0, image_size - 1)
+        return image.blending(axis, places)
 
     def set_kernels(self, plan: KernelPlan) -> None:
         """Set pointers to the planned kernels and to buffers for fragments."""
@@ -422,9 +445,9 @@ class FrameRecord:
         n_blocks = c.block_columns * c.block_rows
         c.block_light = self._buffer("block_light", 4 * n_blocks, np.float32)
         n_blocks *= c.surface_count
-        c.fragments = self._buffer("fragments", n_blocks * BLOCK_PIXELS, FRAGMENT)
-        c.lights = self._buffer("lights", n_blocks * BLOCK_PIXELS, FRAGMENT_LIGHT)
-        n_places = n_blocks * BLOCK_PIXELS + BOX_PADDING_COUNT
+        c.fragments = self._buffer("fragments", n_blocks * c.block_slots, FRAGMENT)
+        c.lights = self._buffer("lights", n_blocks * c.block_slots, FRAGMENT_LIGHT)
+        n_places = n_blocks * c.block_slots + BOX_PADDING_COUNT
         for side in range(4):
             c.boxes[side] = self._buffer(f"boxes {side}", n_places, np.int16)
         c.blocks = self._buffer("blocks", n_blocks, BLOCK)
