@@ -185,12 +185,16 @@ def object_range_dpt(view: RgbdView) -> tuple[float, float]:
 
 
 WHITE_STEP_PX = 8
-"""Stride in pixels at which the white level is sampled."""
+"""Stride in pixels at which the white level is sampled.  Each sample is the median of
+three adjacent pixels, so that a single bright pixel is never one."""
 
-LIT_PERCENTILE, PERCENTILE, WHITE_RATIO = 90.0, 99.6, 2.0
-"""The white level of a linear image is its maximum, but at most this ratio times the
-90th percentile of its lit pixels and the 99.6th percentile of all, so that a small
-light source does not set it, even alone in the dark."""
+PEAK_QUANTILES = 0.98, 0.998
+LIT_QUANTILES, ALL_QUANTILES = (0.85, 0.95), (0.99, 0.996)
+LIT_RATIO, WHITE_RATIO = 1e-3, 2.0
+"""The white level of a linear image is the mean of its brightest samples, but at most
+`WHITE_RATIO` times lower quantiles, of the lit samples and of all, so that a small
+light source does not set it, even alone in the dark.  A mean over a range of quantiles
+changes less than one quantile if a sample changes."""
 
 
 def white_level(color: NDArray[Any]) -> float:
@@ -200,13 +204,36 @@ def white_level(color: NDArray[Any]) -> float:
     """
     if color.dtype == np.uint8:
         return 1.0
-    light = np.abs(color[::WHITE_STEP_PX, ::WHITE_STEP_PX].astype(np.float64))
-    light = light[np.isfinite(light)]
-    lit = light[light > 0.0]
-    if lit.size == 0:
+    rows, columns = (np.arange(0, size, WHITE_STEP_PX) for size in color.shape[:2])
+    below, right = (
+        np.minimum(at + 1, size - 1)
+        for at, size in zip((rows, columns), color.shape[:2], strict=True)
+    )
+    one, two, three = (
+        color[np.ix_(*at)].astype(np.float32)
+        for at in ((rows, columns), (rows, right), (below, columns))
+    )
+    light = np.abs(
+        np.maximum(np.minimum(one, two), np.minimum(np.maximum(one, two), three))
+    )
+    light = np.sort(light[np.isfinite(light)])
+    most = _mean_between(light, ALL_QUANTILES)
+    lit = light[np.searchsorted(light, LIT_RATIO * most, side="right") :]
+    return min(
+        _mean_between(lit, PEAK_QUANTILES),
+        WHITE_RATIO * _mean_between(lit, LIT_QUANTILES),
+        WHITE_RATIO * most,
+    )
+
+
+def _mean_between(
+    ascending: NDArray[np.float32], quantiles: tuple[float, float]
+) -> float:
+    """Return the mean of the values between two quantiles; 0 if there is none."""
+    if ascending.size == 0:
         return 0.0
-    limits = np.percentile(lit, LIT_PERCENTILE), np.percentile(light, PERCENTILE)
-    return float(min(lit.max(), WHITE_RATIO * min(limits)))
+    first, last = (int(share * ascending.size) for share in quantiles)
+    return float(ascending[first : max(last, first + 1)].mean(dtype=np.float64))
 
 
 GazeDirection = tuple[float, float, float]

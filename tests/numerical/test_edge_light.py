@@ -16,11 +16,12 @@ from filter_service.rendering import edge_kinds, edge_light
 from filter_service.rendering.edge_kinds import FADE_WHITE
 from filter_service.rendering.edge_light import EdgeLight
 from filter_service.rendering.engine import ViewRequest
+from filter_service.rendering.frame import white_level
 from filter_service.rendering.media_effects import begin_through_media, encoded
 from filter_service.rgbd_view import RgbdView
 from filter_service.view_state import State
 from tests.grid_specs import grid_spec
-from tests.numerical.synthetic import Bench, assert_same_frame, tangents
+from tests.numerical.synthetic import Bench, assert_same_frame, tangents, texture
 from tests.reference.edge_light import lamp_light, ring_ratios
 
 WIDTH, HEIGHT = 180, 160
@@ -238,6 +239,40 @@ def test_the_light_fades_in(engine):
         seen(bench, lit(100.0))[Y, X + 12, 1] - without(bench, lit(100.0))[Y, X + 12, 1]
     )
     assert added[-1] == pytest.approx(full / 100.0, rel=0.02)
+
+
+@pytest.mark.parametrize("level", [1.0, 5.0, 20.0, 1000.0])
+def test_one_bright_pixel_does_not_move_the_white_level(rng, level):
+    """At most to those of its neighbors, if it is next to a sample."""
+    color = texture(rng, HEIGHT, WIDTH) ** 2
+    white = white_level(color)
+    assert 0.7 * color.max() < white <= color.max()
+    for y, x in 8 * rng.integers((HEIGHT // 8, WIDTH // 8), size=(20, 2)):
+        one = color.copy()
+        one[y, x] = level * white
+        assert white_level(one) == pytest.approx(white, rel=0.01)
+        assert white_level(4.0 * one) == pytest.approx(4.0 * white_level(one))
+
+
+def test_a_lamp_that_fills_a_sample_does_not_set_the_white_level(rng):
+    color = texture(rng, HEIGHT, WIDTH) ** 2
+    white = white_level(color)
+    color[64:72, 64:72] = LAMP
+    assert white_level(color) == pytest.approx(white, rel=0.05)
+
+
+@pytest.mark.parametrize("level", [1.0, 20.0])
+def test_other_pixels_keep_their_light_beside_a_bright_pixel(engine, rng, level):
+    """Neither does another lamp change."""
+    bench = bench_of(engine)
+    color = texture(rng, HEIGHT, WIDTH) ** 2
+    color[Y, X] = 60.0
+    before = without(bench, color, 0.4)
+    color[8, 16] = level
+    after = without(bench, color, 0.4)
+    far = np.hypot(*(np.indices((HEIGHT, WIDTH)) - [[[8]], [[16]]])) > 60.0
+    np.testing.assert_array_equal(after[far], before[far])
+    assert np.abs(after[~far] - before[~far]).max() > 1e-3
 
 
 @pytest.mark.both_engines

@@ -175,6 +175,8 @@ def test_the_surroundings_of_the_gaze_stay_and_errors_follow_the_threshold(
     field_bench, rng, gaze_deg
 ):
     color = texture(rng, 3 * SIZE, 3 * SIZE)
+    color[:16] = 1.0  # white
+    assert white_level(color) == pytest.approx(1.0, rel=0.01)
     exact, plain, merged = (
         see_field(field_bench, color, gaze_deg, **options)
         for options in ({"merge": False}, {}, {"peripheral_merging": True})
