@@ -189,8 +189,8 @@ WHITE_STEP_PX = 8
 three adjacent pixels, so that a single bright pixel is never one."""
 
 PEAK_QUANTILES = 0.98, 0.998
-LIT_QUANTILES, ALL_QUANTILES = (0.85, 0.95), (0.99, 0.996)
-LIT_RATIO, WHITE_RATIO = 1e-3, 2.0
+LIT_QUANTILES, ALL_QUANTILES = (0.8, 0.9), (0.99, 0.996)
+LIT_RATIO, WHITE_RATIO = 1e-6, 2.0
 """The white level of a linear image is the mean of its brightest samples, but at most
 `WHITE_RATIO` times lower quantiles, of the lit samples and of all, so that a small
 light source does not set it, even alone in the dark.  A mean over a range of quantiles

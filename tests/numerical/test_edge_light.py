@@ -254,11 +254,14 @@ def test_one_bright_pixel_does_not_move_the_white_level(rng, level):
         assert white_level(4.0 * one) == pytest.approx(4.0 * white_level(one))
 
 
-def test_a_lamp_that_fills_a_sample_does_not_set_the_white_level(rng):
+@pytest.mark.parametrize("share", [0.001, 0.03, 0.08])
+def test_lamps_do_not_set_the_white_level(rng, share):
+    """A window may fill nearly a tenth of the image."""
     color = texture(rng, HEIGHT, WIDTH) ** 2
     white = white_level(color)
-    color[64:72, 64:72] = LAMP
-    assert white_level(color) == pytest.approx(white, rel=0.05)
+    edge_px = int(np.sqrt(share * HEIGHT * WIDTH))
+    color[60 : 60 + edge_px, 64 : 64 + edge_px] = LAMP
+    assert 0.95 * white < white_level(color) < 1.7 * white
 
 
 @pytest.mark.parametrize("level", [1.0, 20.0])
