@@ -129,9 +129,13 @@ INLINE int prepare_addition(const frame *f, uint32_t index, float share, depth_g
     if (m.pairs <= 0 || m.rows <= 0) return 0;
     float scale = image->scale * share;
     float red = scale * light->rgb[0], green = scale * light->rgb[1];
-    float blue = scale * light->rgb[2], strength = scale * light->strength;
-    float coverage = scale * light->coverage, excess = scale * light->excess;
-    own->is_lit = 1;
+    float blue = scale * light->rgb[2], excess = scale * light->excess;
+    float strength = scale * light->share, coverage = scale;
+    if (is_hidden(f, index)) {
+        coverage = strength;
+        strength = 0.0f;
+    }
+    light_raster(own);
     a->to = own->pairs + (m.row + r.top) * own->stride + m.pair;
     a->to_stride = own->stride;
     a->rows = m.rows;

@@ -17,8 +17,7 @@ typedef struct {
     float place[BLOCK_PIXELS];       /* in layers */
     float spread_px[BLOCK_PIXELS];
     uint32_t kernel[BLOCK_PIXELS];
-    float strength[BLOCK_PIXELS];    /* of edges of the visible surface, 0 to 1 */
-    float coverage[BLOCK_PIXELS];    /* of hidden pixels, 0 to 1; not set in the visible surface */
+    float share[BLOCK_PIXELS];       /* strength of an edge; on the hidden surface, coverage */
     float bright[RGB];        /* light above which it is not amplified */
     uint64_t held;            /* pixels that are not empty */
     uint64_t edges;           /* pixels next to another surface, or hidden */
@@ -83,7 +82,7 @@ INLINE uint64_t find_edges(block *b) {
         f32x8 most_px = larger8(across, along) * all8(f->blur_px_per_dpt);
         f32x8 beyond = most_px * all8(1.0f / DISCONTINUITY_PX) - all8(1.0f);
         f32x8 strength = smaller8(larger8(beyond, all8(0.0f)), all8(1.0f));
-        store8(b->strength + y * TILE_SIZE_PX, strength * strength);
+        store8(b->share + y * TILE_SIZE_PX, strength * strength);
         edges |= (uint64_t)bits_of8(strength > all8(0.0f)) << (y * TILE_SIZE_PX);
     }
     return edges;
@@ -121,8 +120,8 @@ INLINE void read_row(block *b, int i, size_t first, int width) {
         float change_px = shape->spread_px[1] - shape->spread_px[0];
         f32x4 color = pixel_color(f, b->surface, first + (size_t)x);
         if (b->surface > 0) {
-            b->coverage[i] = hidden_coverage(f, seen_dpt[x], dpt[x]);
-            color *= all4(b->coverage[i]);
+            b->share[i] = hidden_coverage(f, seen_dpt[x], dpt[x]);
+            color *= all4(b->share[i]);
         }
         for (int c = 0; c < RGB; ++c) b->rgb[c][i] = color[c];
         b->dpt[i] = dpt[x];
@@ -157,19 +156,33 @@ INLINE void set_limits(block *b) {
     b->smallest_spread_px *= powf(gain, -1.0f / MERGE_CONTRAST_POWER);
 }
 
+/* Light of eight pixels of the visible surface or, at the end of a row, of fewer. */
+INLINE f32x4 row_light(const frame *f, size_t first, int count) {
+    f32x4 sum = all4(0.0f);
+    if (f->color_kind != COLOR_SRGB8 || count < TILE_SIZE_PX) {
+        for (int x = 0; x < count; ++x) sum += pixel_color(f, 0, first + (size_t)x);
+        return sum;
+    }
+    const uint8_t *bytes = (const uint8_t *)f->color[0] + RGB * first;
+    float rgb[RGB] = {0.0f, 0.0f, 0.0f};
+    for (int x = 0; x < TILE_SIZE_PX; ++x)
+        for (int c = 0; c < RGB; ++c) rgb[c] += linear_of_byte[bytes[RGB * x + c]];
+    return (f32x4){rgb[0], rgb[1], rgb[2], 0.0f};
+}
+
 /* Sums light over each block of a row; four floats each, the last is the number of pixels. */
 static void sum_block_row(void *argument, int row, int thread) {
     (void)thread;
     const frame *f = argument;
     float *to = f->block_light + 4 * (size_t)row * (size_t)f->block_columns;
     for (int column = 0; column < f->block_columns; ++column) {
-        int x1 = smaller_int((column + 1) * TILE_SIZE_PX, f->width);
+        int x0 = column * TILE_SIZE_PX;
+        int count = smaller_int(f->width - x0, TILE_SIZE_PX);
         int y1 = smaller_int((row + 1) * TILE_SIZE_PX, f->height);
         f32x4 sum = all4(0.0f);
         for (int y = row * TILE_SIZE_PX; y < y1; ++y)
-            for (int x = column * TILE_SIZE_PX; x < x1; ++x)
-                sum += pixel_color(f, 0, (size_t)y * (size_t)f->width + (size_t)x);
-        sum[3] = (float)((x1 - column * TILE_SIZE_PX) * (y1 - row * TILE_SIZE_PX));
+            sum += row_light(f, (size_t)y * (size_t)f->width + (size_t)x0, count);
+        sum[3] = (float)(count * (y1 - row * TILE_SIZE_PX));
         store4(to + 4 * column, sum);
     }
 }

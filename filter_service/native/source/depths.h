@@ -69,18 +69,17 @@ INLINE void add_coarse(depth_group *group, int r) {
         if (r == 1) add_halves(&row, fine->pairs + y * fine->stride, fine->width / 2);
         else add_quarters(&row, fine->pairs + y * fine->stride, fine->width / 2);
     }
-    clear_raster(coarse);
+    coarse->is_lit = 0;
 }
 
 /* Converts all light of a group to pixels of 1 px; false if it has none. */
 static int gather_sizes(depth_group *group) {
-    int is_lit = group->sizes[0].is_lit;
     for (int r = 1; r < RESOLUTIONS; ++r) {
         if (!group->sizes[r].is_lit) continue;
-        is_lit = 1;
+        light_raster(group->sizes);
         add_coarse(group, r);
     }
-    return is_lit;
+    return group->sizes[0].is_lit;
 }
 
 INLINE float least_color(f32x8 lanes) {
@@ -99,7 +98,7 @@ static int close_group(window *w, depth_group *group) {
     if (!gather_sizes(group)) return SEEN;
     f32x8 least = all8(1.0f), least_total = all8(1.0f);
     for (int y = 0; y < w->height; ++y) {
-        pixel_pair *open = group->sizes[0].pairs + y * PAIRS_ACROSS;
+        const pixel_pair *open = group->sizes[0].pairs + y * PAIRS_ACROSS;
         pixel_pair *near = w->near + y * PAIRS_ACROSS;
         pixel_pair *total = w->total + y * PAIRS_ACROSS;
         for (int x = 0; x < w->width / 2; ++x) {
@@ -113,8 +112,6 @@ static int close_group(window *w, depth_group *group) {
             total[x].coverage += coverage;
             least = smaller8(near[x].coverage, least);
             least_total = smaller8(total[x].light, least_total);
-            open[x].light = all8(0.0f);
-            open[x].coverage = all8(0.0f);
         }
     }
     group->sizes[0].is_lit = 0;
@@ -200,5 +197,6 @@ static void splat_unordered(const frame *f, const bin_list *list, uint32_t tiles
         if (with_hidden || !is_hidden(f, index)) add_fragment(f, index, 1.0f, w->open, &all);
     }
     flush_additions(&all);
+    light_raster(w->open[0].sizes);
     gather_sizes(w->open);
 }

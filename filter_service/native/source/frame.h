@@ -53,8 +53,7 @@ typedef struct {
 typedef struct {
     float rgb[RGB];           /* times the coverage */
     float depth;              /* sort depth, smaller is nearer */
-    float strength;           /* of an edge of the visible surface, 0 to 1 */
-    float coverage;           /* 1 on the visible surface */
+    float share;              /* strength of an edge; on the hidden surface, coverage */
     float excess;             /* light that missing coverage does not amplify */
 } fragment_light;
 

@@ -14,7 +14,7 @@ typedef struct { f32x8 light, coverage; } pixel_pair;
 typedef struct {
     int x0, y0, width, height;  /* in their own size */
     int stride;                 /* pairs from row to row */
-    int is_lit;
+    int is_lit;                 /* otherwise its sums are not set */
     pixel_pair *pairs;
 } raster;
 
@@ -35,9 +35,11 @@ INLINE void clear_pairs(pixel_pair *pairs, int stride, int width, int height) {
         memset(pairs + y * stride, 0, sizeof *pairs * (size_t)(width / 2));
 }
 
-INLINE void clear_raster(raster *own) {
+/* Clears a raster to which nothing has been added. */
+INLINE void light_raster(raster *own) {
+    if (own->is_lit) return;
     clear_pairs(own->pairs, own->stride, own->width, own->height);
-    own->is_lit = 0;
+    own->is_lit = 1;
 }
 
 /* Sums of a group of depths in all sizes; a tile uses the first elements of each. */
@@ -60,7 +62,6 @@ INLINE depth_group open_group(int x0, int y0, int width, int height, group_sums 
     for (int r = 1; r < RESOLUTIONS; ++r)
         group.sizes[r] = (raster){(x0 >> r) - 1, (y0 >> r) - 1, (width >> r) + 2,
                                   (height >> r) + 2, ((width >> r) + 2) / 2, 0, coarse[r]};
-    for (int r = 0; r < RESOLUTIONS; ++r) clear_raster(group.sizes + r);
     return group;
 }
 
