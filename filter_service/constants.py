@@ -33,9 +33,14 @@ TOTAL_ENTRIES = 0
 TOTAL_ENTRIES_FLOAT = 1
 TOTAL_LOST = 2
 TOTAL_LONGEST = 3
-TOTAL_WORDS = 4
+TOTAL_TILES = 4
+TILE_KINDS = 3
+TOTAL_WORDS = TOTAL_TILES + TILE_KINDS
 """Words after the bins' offsets: entries of all lists, the same as a float, dropped
-entries, length of the longest list."""
+entries, length of the longest list, tiles of each kind: those in which order does not
+matter, those in which it does, and of these the ones that light of a hidden surface
+reaches.  The splat has a dispatch for each kind, because llvmpipe executes both sides
+of every branch."""
 
 STAT_MISSING = 0
 STAT_CLAMPED = 1
@@ -51,11 +56,12 @@ work groups that all add to one word wait for each other."""
 DISPATCH_SCATTER = 0
 DISPATCH_SORT = 1
 DISPATCH_SPLAT = 4
-DISPATCH_COUNT = 5
+DISPATCH_COUNT = DISPATCH_SPLAT + TILE_KINDS
 DISPATCH_WORDS = 4
 DISPATCH_BYTES = 4 * DISPATCH_WORDS
 """Dispatches whose size a pass determines: the scatter, a sort for each of three size
-classes, the splat; each is group counts along three axes, and an unused word."""
+classes, a splat for each kind of tiles; each is group counts along three axes, and an
+unused word."""
 
 ENTRIES_EXACT = 2.0**31
 """Sums of list lengths below this fit in a word."""
@@ -107,6 +113,9 @@ Groups are `DISCONTINUITY_PX` of blur deep, at fixed depths."""
 EXCESS_RATIO = 4.0
 """Light above this times the mean of the surroundings is not amplified where coverage
 is missing: a lamp beside a near edge is not a surface that continues behind it."""
+
+NEAREST_GROUP = -1.0e9
+"""Nearer than every group of depths."""
 
 NOTHING_DPT = -1.0
 """Object distance of an empty hidden pixel."""
@@ -330,7 +339,11 @@ BINDINGS = {
     "BINDING_USED": 14,
     "BINDING_COLOR_OUT": 15,
     # The passes that build lists do not use the input color, those before them do not
-    # use the output color, and the scan does not use fragments.
+    # use the output color, and the scan does not use fragments.  Fragments are made
+    # after the used pairs are read, and before bins are counted.
+    "BINDING_FRAGMENT_EDGE": 14,
+    "BINDING_BLOCK_LIGHT": 7,
+    "BINDING_TILES": 3,
     "BINDING_WINDOWS": 0,
     "BINDING_STATS": 15,
     "BINDING_DISPATCHES": 5,

@@ -7,7 +7,8 @@
 //      or both in textures when FROM_TEXTURES, where missing depth is infinite,
 //      LAYER_DPT, FIELD_DEFOCUS (change of defocus at the corners of the cells).
 // Out: PIXELS (linear RGB, vergence dpt; negative where nothing is hidden),
-//      PIXEL_LAYER (position), USED (a bit per cell and interval), STATS
+//      PIXEL_LAYER (position), BLOCK_LIGHT (sum of the visible surface's linear RGB over a
+//      block, number of its pixels), USED (a bit per cell and interval), STATS
 //      (pixels without depth, outside the prepared distances, and without a finite color,
 //      which becomes 0).
 // Dispatch: one thread per pixel, 8 x 8 groups, z is the surface.
@@ -27,6 +28,7 @@ layout(std430, binding = BINDING_DEPTH_IN) readonly buffer DepthIn { float depth
 layout(std430, binding = BINDING_LAYER_DPT) readonly buffer LayerDpt { float layer_dpt[]; };
 layout(std430, binding = BINDING_PIXELS) writeonly buffer Pixels { vec4 pixels[]; };
 layout(std430, binding = BINDING_PIXEL_LAYER) writeonly buffer Position { float position[]; };
+layout(std430, binding = BINDING_BLOCK_LIGHT) writeonly buffer Light { vec4 block_light[]; };
 layout(std430, binding = BINDING_FIELD_DEFOCUS) readonly buffer Field { float field_dpt[]; };
 // Coherent: bits set by other groups are visible, and not set again.
 layout(std430, binding = BINDING_USED) coherent buffer Used { uint used[]; };
@@ -51,6 +53,7 @@ uniform float blur_px_per_dpt;    // slope of defocus blur at this pupil
 
 shared uint group_used[MAX_LAYERS / BITS_PER_WORD];
 shared uint group_stats[STAT_FRAGMENTS];  // counters of this pass
+shared vec4 group_light[THREADS];         // linear RGB and 1, of each pixel in the image
 
 #ifdef FROM_TEXTURES
 ivec2 image_pixel(uint pixel) {
@@ -145,17 +148,21 @@ float layer_position(float dpt) {
     return float(low) + clamp((dpt - layer_dpt[low]) / span, 0.0, 1.0);
 }
 
+float prepared_dpt(float dpt) {
+    return clamp(dpt, vergence_range_dpt.x, vergence_range_dpt.y);
+}
+
 // Object distance, or NOTHING_DPT if a hidden pixel is empty, or so close to the surface
 // in front of it that the two would blur alike.
 float distance_of(uint pixel, uint seen, vec2 at) {
     float depth_m = read_depth_m(pixel);
 #ifdef FROM_TEXTURES
-    if (!is_depth(depth_m)) return 0.0;
+    if (!is_depth(depth_m)) return prepared_dpt(0.0);
 #endif
-    if (pixel == seen) return vergence_dpt(depth_m, at);
+    if (pixel == seen) return prepared_dpt(vergence_dpt(depth_m, at));
     if (!is_depth(depth_m)) return NOTHING_DPT;
-    float dpt = vergence_dpt(depth_m, at);
-    float behind = vergence_dpt(read_depth_m(seen), at) - dpt;
+    float dpt = prepared_dpt(vergence_dpt(depth_m, at));
+    float behind = prepared_dpt(vergence_dpt(read_depth_m(seen), at)) - dpt;
     return behind * blur_px_per_dpt > DISCONTINUITY_PX ? dpt : NOTHING_DPT;
 }
 
@@ -182,11 +189,28 @@ void note_faults(ivec2 at, uint pixel, uint seen, bool is_finite) {
         atomicAdd(group_stats[STAT_CLAMPED], 1u);
 }
 
+// Sums the light of the visible surface in the group's block, row by row.
+void sum_light(uint thread) {
+    if (thread < uint(TILE_SIZE_PX)) {
+        vec4 row = vec4(0.0);
+        for (int x = 0; x < TILE_SIZE_PX; ++x)
+            row += group_light[int(thread) * TILE_SIZE_PX + x];
+        group_light[thread * uint(TILE_SIZE_PX)] = row;
+    }
+    barrier();  // the sums of the rows are known
+    if (thread == 0u) {
+        vec4 sum = vec4(0.0);
+        for (int y = 0; y < TILE_SIZE_PX; ++y) sum += group_light[y * TILE_SIZE_PX];
+        block_light[gl_WorkGroupID.y * gl_NumWorkGroups.x + gl_WorkGroupID.x] = sum;
+    }
+}
+
 void main() {
     uint thread = gl_LocalInvocationIndex;
     for (uint word = thread; word < uint(words_per_cell); word += uint(THREADS))
         group_used[word] = 0u;
     if (thread < uint(STAT_FRAGMENTS)) group_stats[thread] = 0u;
+    group_light[thread] = vec4(0.0);
     barrier();  // all bits are clear
     ivec2 at = ivec2(gl_GlobalInvocationID.xy);
     if (all(lessThan(at, frame_size_px))) {
@@ -197,17 +221,18 @@ void main() {
         note_faults(at, pixel, seen, is_finite);
         float dpt = distance_of(pixel, seen, vec2(at));
         if (dpt >= 0.0) {
-            dpt = clamp(dpt, vergence_range_dpt.x, vergence_range_dpt.y);
             float place = layer_position(dpt + field_defocus_dpt(at));
             position[pixel] = place;
             note_use(at, place);
         }
         pixels[pixel] = vec4(linear_rgb, dpt);
+        group_light[thread] = vec4(linear_rgb, 1.0);
     }
     barrier();  // all pixels of the group have set their bits
     uint lane = (gl_WorkGroupID.x + gl_WorkGroupID.y) % uint(STAT_LANES);
     if (thread < uint(STAT_FRAGMENTS) && group_stats[thread] != 0u)
         atomicAdd(stats[lane * uint(STAT_WORDS) + thread], group_stats[thread]);
+    if (gl_WorkGroupID.z == 0u) sum_light(thread);
     if (!group_lies_in_one_cell()) return;
     int first = cell_of(ivec2(gl_WorkGroupID.xy) * TILE_SIZE_PX) * words_per_cell;
     for (uint word = thread; word < uint(words_per_cell); word += uint(THREADS)) {

@@ -1,7 +1,8 @@
 // Counts the fragments whose light reaches each bin, and marks the tiles in which two
 // surfaces meet, so that order matters.
 // In:  FRAGMENT_PLACE, BLOCKS, PLAN.   Out: BIN_COUNTS (kept, a bit for each tile whose order
-//      matters, entries beyond the capacity of a list), WINDOWS (blocks that reach a bin).
+//      matters, entries beyond the capacity of a list, a bit for each tile that light of a
+//      hidden surface reaches, unless order always matters), WINDOWS (blocks that reach a bin).
 // Dispatch: one group of GROUP_THREADS per bin: 8 on a software renderer, so that its
 //      vectors are full, THREADS on hardware.
 // Twin: tests/numerical/tile_lists.py (lists by comparing all pairs).
@@ -27,6 +28,7 @@ uniform int order_always;
 
 shared uint total;
 shared uint ordered_tiles;
+shared uint hidden_tiles;
 shared int window_low[2];
 shared int window_high[2];
 
@@ -61,6 +63,7 @@ void main() {
     if (gl_LocalInvocationIndex == 0u) {
         total = 0u;
         ordered_tiles = order_always != 0 ? uint(ALL_TILES) : 0u;
+        hidden_tiles = 0u;
         for (int axis = 0; axis < 2; ++axis) {
             window_low[axis] = tile_grid[axis];
             window_high[axis] = 0;
@@ -73,23 +76,26 @@ void main() {
     Walk walk = start_walk(bin, window);
     uint count = 0u;
     uint edges = 0u;
+    uint covered = 0u;
     Stretch stretch;
     while (next_stretch(walk, stretch)) {
         // Where light of a hidden surface arrives, a surface lies in front of it.
-        bool hidden = stretch.block >= tile_grid.x * tile_grid.y;
+        bool is_hidden = stretch.block >= tile_grid.x * tile_grid.y;
         for (uint slot = stretch.first; slot < stretch.end; ++slot) {
             uvec4 place = places[slot];
             uint tiles = tiles_in_reach(place, bin);
             count += tiles != 0u ? 1u : 0u;
-            edges |= hidden || (place.y & EDGE_BIT) != 0u ? tiles : 0u;
+            edges |= (place.y & EDGE_BIT) != 0u ? tiles : 0u;
+            covered |= is_hidden ? tiles : 0u;
         }
     }
     atomicAdd(total, count);
-    atomicOr(ordered_tiles, edges);
+    atomicOr(ordered_tiles, edges | covered);
+    if (order_always == 0) atomicOr(hidden_tiles, covered);
     barrier();  // all threads have added
     if (gl_LocalInvocationIndex == 0u) {
         uint kept = min(total, list_capacity);
         windows[index] = window;
-        counts[index] = uvec4(kept, ordered_tiles, total - kept, 0u);
+        counts[index] = uvec4(kept, ordered_tiles, total - kept, hidden_tiles);
     }
 }

@@ -101,7 +101,11 @@ class FragmentPasses:
     def build_fragments(self, kernels: KernelRun) -> None:
         """Compute linear light, vergence and layer of pixels, and the used pairs."""
         n_pixels = self.strip.surface_count * self.strip.pixel_count
-        self.strip.reserve(PIXELS=16 * n_pixels, PIXEL_LAYER=4 * n_pixels)
+        self.strip.reserve(
+            PIXELS=16 * n_pixels,
+            PIXEL_LAYER=4 * n_pixels,
+            BLOCK_LIGHT=16 * self.strip.tile_count,
+        )
         self.strip.kernel_buffers = kernels.buffers
         source = self.source()
         with self.strip.timer.stage("fragments_ms"):
@@ -109,7 +113,7 @@ class FragmentPasses:
                 "build_fragments",
                 (*self.strip.grid, self.strip.surface_count),
                 *(*source.pop("bindings"), "LAYER_DPT", "FIELD_DEFOCUS"),
-                *("PIXELS", "PIXEL_LAYER", "USED", "STATS"),
+                *("PIXELS", "PIXEL_LAYER", "BLOCK_LIGHT", "USED", "STATS"),
                 **self._common,
                 words_per_cell=words_per_cell(self.strip.layers),
                 tangents=self.strip.view.tangents,
@@ -141,6 +145,7 @@ class FragmentPasses:
         self.strip.reserve(
             FRAGMENT_COLOR=16 * slots,
             FRAGMENT_PLACE=16 * slots,
+            FRAGMENT_EDGE=8 * slots,
             BLOCKS=16 * self.strip.block_count,
         )
         for surface in range(self.strip.surface_count):
@@ -149,7 +154,8 @@ class FragmentPasses:
                     "merge_fragments",
                     self.strip.grid,
                     *("PIXELS", "PIXEL_LAYER", "KERNELS", "KERNEL_OF"),
-                    *("FRAGMENT_COLOR", "FRAGMENT_PLACE", "BLOCKS", "STATS", "PLAN"),
+                    *("BLOCK_LIGHT", "FRAGMENT_COLOR", "FRAGMENT_PLACE"),
+                    *("FRAGMENT_EDGE", "BLOCKS", "STATS", "PLAN"),
                     **self._common,
                     blur_px_per_dpt=self.strip.layers.blur_px_per_dpt,
                     max_level=self._max_level,

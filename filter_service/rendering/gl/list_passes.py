@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from filter_service.constants import (
     BATCH,
+    BIN_TILES,
     DISPATCH_BYTES,
     DISPATCH_COUNT,
     DISPATCH_SCATTER,
@@ -18,16 +19,18 @@ from filter_service.constants import (
     SORT_CAPACITIES,
     SORT_KEY_BITS,
     THREADS,
+    TILE_KINDS,
     TILE_SIZE_PX,
     TILES_PER_BIN,
     TOTAL_ENTRIES,
     TOTAL_ENTRIES_FLOAT,
     TOTAL_LONGEST,
     TOTAL_LOST,
+    TOTAL_TILES,
     TOTAL_WORDS,
 )
 from filter_service.gl.passes import Atlas, Buffer
-from filter_service.rendering.gl.strip import Strip
+from filter_service.rendering.gl.strip import Strip, group_count
 
 ENTRY_BYTES = 4
 MAX_BAND_ENTRIES = 16 * 2**20
@@ -52,11 +55,14 @@ class ListTotals:
         Entries that did not fit a bin's list.
     longest : int
         Entries of the longest list.
+    tiles : tuple of int
+        Number of tiles of each kind.
     """
 
     entry_count: int = 0
     overflow_count: int = 0
     longest: int = 0
+    tiles: tuple[int, ...] = (0,) * TILE_KINDS
 
 
 def read_totals(whole: NDArray[np.uint32]) -> ListTotals:
@@ -67,6 +73,7 @@ def read_totals(whole: NDArray[np.uint32]) -> ListTotals:
         entry_count=rounded if rounded > 2**31 else int(whole[TOTAL_ENTRIES]),
         overflow_count=int(whole[TOTAL_LOST]),
         longest=int(whole[TOTAL_LONGEST]),
+        tiles=tuple(whole[TOTAL_TILES : TOTAL_TILES + TILE_KINDS].tolist()),
     )
 
 
@@ -142,6 +149,7 @@ class ListPasses:
         self._is_late = is_late
         self.lists = ListTotals()
         self.bands: list[tuple[int, int, int]] = []
+        self._tile_sums = np.zeros((0, TILE_KINDS), np.int64)
 
     def run(self) -> None:
         """Build, sort and splat the lists in the existing buffers, without a readback.
@@ -191,6 +199,7 @@ class ListPasses:
             BIN_COUNTS=16 * self.strip.bin_count,
             WINDOWS=16 * self.strip.bin_count,
             BIN_OFFSETS=4 * (self.strip.bin_count + TOTAL_WORDS),
+            TILES=4 * TILE_KINDS * self._tile_room,
             DISPATCHES=DISPATCH_BYTES * DISPATCH_COUNT,
             ENTRIES=_list_bytes(0),
             ENTRIES_SPARE=_list_bytes(0),
@@ -208,12 +217,19 @@ class ListPasses:
             self.strip.run(
                 "scan_bins",
                 (1, 1),
-                *("BIN_COUNTS", "BIN_OFFSETS", "DISPATCHES", "PLAN"),
+                *("BIN_COUNTS", "BIN_OFFSETS", "DISPATCHES", "TILES", "PLAN"),
+                tile_grid=self.strip.grid,
+                bin_columns=self.strip.bin_grid[0],
                 bin_count=self.strip.bin_count,
                 entry_capacity=entry_capacity,
                 spare_capacity=spare_capacity,
                 needs_all_psfs=int(not self._is_late),
             )
+
+    @property
+    def _tile_room(self) -> int:
+        """Capacity of the list of the tiles of each kind."""
+        return TILES_PER_BIN * self.strip.bin_count
 
     @property
     def _bin_uniforms(self) -> dict[str, Any]:
@@ -237,8 +253,9 @@ class ListPasses:
             return [(0, self.strip.bin_count, self.lists.entry_count)]
         counts = self.strip.gpu.read(
             self.strip.buffers["BIN_COUNTS"], (self.strip.bin_count, 4), np.uint32
-        )[:, 0].astype(np.int64)
-        offsets, bands = split(counts, limit)
+        )
+        self._tile_sums = self._sum_tiles(counts)
+        offsets, bands = split(counts[:, 0].astype(np.int64), limit)
         self.strip.gpu.write(
             self.strip.buffers["BIN_OFFSETS"], offsets.astype(np.uint32)
         )
@@ -300,21 +317,57 @@ class ListPasses:
             self._sort(first_bin, bin_count, indirect)
 
     def _splat(self, first_bin: int, bin_count: int, *, indirect: bool) -> None:
-        with self.strip.timer.stage("splat_ms"):
-            self.strip.run(
-                "splat_tiles",
-                (TILES_PER_BIN, bin_count),
-                *("FRAGMENT_COLOR", "FRAGMENT_PLACE", "BIN_COUNTS", "BIN_OFFSETS"),
-                *("ENTRIES", "KERNELS", "PIXELS", "COLOR_OUT"),
-                textures={"ATLAS": self.atlas},
-                frame_size_px=self.strip.size,
-                tile_grid=self.strip.grid,
-                bin_columns=self.strip.bin_grid[0],
-                first_bin=first_bin,
-                blur_px_per_dpt=self.strip.layers.blur_px_per_dpt,
-                defines=self._splat_variant(),
-                indirect=self._groups_on_gpu(DISPATCH_SPLAT, indirect),
-            )
+        """Splat the tiles of a band, one kind of tiles at a time."""
+        ranges = self._tile_ranges(first_bin, bin_count, indirect=indirect)
+        for kind, variant in self._splat_variants.items():
+            first, end = ranges[kind]
+            with self.strip.timer.stage("splat_ms"):
+                self.strip.run(
+                    "splat_tiles",
+                    (TILES_PER_BIN, group_count(end - first, TILES_PER_BIN)),
+                    *("FRAGMENT_COLOR", "FRAGMENT_PLACE", "FRAGMENT_EDGE", "TILES"),
+                    *("BIN_COUNTS", "BIN_OFFSETS", "ENTRIES", "KERNELS", "PIXELS"),
+                    "COLOR_OUT",
+                    textures={"ATLAS": self.atlas},
+                    frame_size_px=self.strip.size,
+                    tile_grid=self.strip.grid,
+                    bin_columns=self.strip.bin_grid[0],
+                    first_tile=kind * self._tile_room + first,
+                    tile_end=kind * self._tile_room + end,
+                    blur_px_per_dpt=self.strip.layers.blur_px_per_dpt,
+                    defines=variant,
+                    indirect=self._groups_on_gpu(DISPATCH_SPLAT + kind, indirect),
+                )
+
+    def _tile_ranges(
+        self, first_bin: int, bin_count: int, *, indirect: bool
+    ) -> list[tuple[int, int]]:
+        """Return the ranges of a band's tiles within the lists of each kind."""
+        if indirect:
+            return [(0, self._tile_room)] * TILE_KINDS
+        if bin_count == self.strip.bin_count:
+            return [(0, count) for count in self.lists.tiles]
+        sums = self._tile_sums
+        ends = sums[first_bin], sums[first_bin + bin_count]
+        return [(int(first), int(end)) for first, end in zip(*ends, strict=True)]
+
+    def _sum_tiles(self, counts: NDArray[np.uint32]) -> NDArray[np.int64]:
+        """Return the numbers of tiles of each kind (bins + 1, kinds) before each bin.
+
+        Parameters
+        ----------
+        counts : (n_bins, 4)
+            Words of BIN_COUNTS.
+        """
+        bins = np.arange(len(counts))[:, None]
+        tiles = np.arange(TILES_PER_BIN)
+        columns, rows = self.strip.grid
+        x = bins % self.strip.bin_grid[0] * BIN_TILES + tiles % BIN_TILES
+        y = bins // self.strip.bin_grid[0] * BIN_TILES + tiles // BIN_TILES
+        ordered, hidden = (counts[:, [word]] >> tiles & 1 for word in (1, 3))
+        kind = np.where((x < columns) & (y < rows), ordered + (ordered & hidden), -1)
+        of_bin = (kind[..., None] == np.arange(TILE_KINDS)).sum(axis=1)
+        return np.concatenate([np.zeros((1, TILE_KINDS), np.int64), of_bin.cumsum(0)])
 
     def _sort(self, first_bin: int, bin_count: int, indirect: bool) -> None:
         """Sort the lists of a band, one size class at a time."""
@@ -350,9 +403,15 @@ class ListPasses:
             return {"GROUP_THREADS": SOFTWARE_LIST_THREADS, "STRETCH_SLOTS": THREADS}
         return {"GROUP_THREADS": THREADS, "STRETCH_SLOTS": HARDWARE_STRETCH_SLOTS}
 
-    def _splat_variant(self) -> dict[str, int]:
+    @property
+    def _splat_variants(self) -> dict[int, dict[str, int]]:
+        """Variants of the pass by the kind of tiles."""
         software = self.strip.gpu.is_software
-        return {**(SOFTWARE_SPLAT if software else HARDWARE_SPLAT), **self._rule}
+        common = SOFTWARE_SPLAT if software else HARDWARE_SPLAT
+        if self.strip.paper_rule:
+            return {1: {**common, **self._rule}}
+        ordered = {**common, "IN_ORDER": 1}
+        return {0: common, 1: ordered, 2: {**ordered, "HAS_HIDDEN": 1}}
 
     def counts(self) -> dict[str, int]:
         """Return the counts of `ViewResult` by name."""
