@@ -149,7 +149,7 @@ def _triangle(first, second):
     ]
 
 
-def _corners(eye, spec, plan, states, object_dpt, axes):
+def plan_corners(eye, spec, plan, states, object_dpt, axes):
     """Read all axes of a plan, or only some and the others exactly."""
     count = states.h_deg.size
 
@@ -264,7 +264,7 @@ def state_errors(
 
     ``stored``: blend kernels as a cache holds them, trimmed and in 16 bits.
     """
-    corners = _corners(eye, spec, plan, states, object_dpt, axes)
+    corners = plan_corners(eye, spec, plan, states, object_dpt, axes)
     kept = corners.weights > 1e-9
     exact = exact_kernels(eye, spec, states)
     blended = exact_kernels(

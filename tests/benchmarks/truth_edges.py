@@ -1,0 +1,227 @@
+"""Lamps beside edges, windows of frames, and distant light, for `bench_truth`."""
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from filter_service.camera import Camera
+from filter_service.rendering.media_effects import linear_from_srgb
+from filter_service.rgbd_view import RgbdView
+from tests.benchmarks.photograph import motorcycle
+from tests.benchmarks.truth_points import (
+    PointState,
+    PointTruth,
+    camera_around,
+    filtered,
+    opened,
+    placed,
+    wavefronts_of,
+)
+
+SIZE_PX = 161, 121
+EDGE_X_PX, LAMP_Y_PX = 80, 60
+PUPIL_MM = 6.0
+AWAY_DPT = 2.0
+"""Distance of the lamp from the edge: blur of 6 px."""
+
+EDGES_DPT = {"emmetropia": 3.0, "myopia": 8.0, "post_lasik": 3.0}
+"""Eyes, and a distance that they can focus on."""
+
+
+@dataclass(frozen=True)
+class LampEnergy:
+    """Light of a lamp in a frame, relative to the lamp's, by distance and color (n, 3).
+
+    Attributes
+    ----------
+    seen, exact : (n, 3)
+    """
+
+    seen: np.ndarray
+    exact: np.ndarray
+
+    @property
+    def error(self) -> float:
+        """Largest difference."""
+        return float(np.abs(self.seen - self.exact).max())
+
+
+def lamp_energies(
+    eye_name: str,
+    engine: str,
+    truth: PointTruth,
+    *,
+    tolerances: tuple[float, ...] = (0.0, 1.0),
+    distances_px: tuple[int, ...] = (1, 2, 3, 4, 5, 6),
+) -> dict[tuple[str, str, float], LampEnergy]:
+    """Return energies by place (behind, before), layers and tolerance.
+
+    The surface at the left, up to `EDGE_X_PX`, is black and in focus.  The lamp is a
+    pixel of the other one, whose pixel center is 0.5 px less than its distance from the
+    edge.  With two layers, the farther surface continues, black, behind the nearer one.
+    """
+    edge_dpt = EDGES_DPT[eye_name]
+    camera = camera_around(0.0, 0.0, SIZE_PX)
+    width, height = SIZE_PX
+    is_left = np.broadcast_to(np.arange(width) < EDGE_X_PX, (height, width))
+    settings = {
+        "mode": "quality",
+        "focus_range_dpt": (0.0, edge_dpt + 0.5),
+        "object_range_dpt": (0.0, 12.0),
+    }
+    found = {}
+    with opened(eye_name, camera, engine, **settings) as eye_filter:
+        for place, lamp_dpt in (
+            ("behind", edge_dpt - AWAY_DPT),
+            ("before", edge_dpt + AWAY_DPT),
+        ):
+            state = PointState(PUPIL_MM, edge_dpt, lamp_dpt)
+            depth_m = np.where(is_left, 1.0 / edge_dpt, 1.0 / lamp_dpt)
+            far_m = max(1.0 / edge_dpt, 1.0 / lamp_dpt)
+            is_near = is_left if place == "behind" else ~is_left
+            hidden = (
+                np.zeros((height, width, 3), np.float32),
+                np.where(is_near, far_m, 0.0).astype(np.float32),
+            )
+            for layers, layer in (("one layer", (None, None)), ("two layers", hidden)):
+                for tolerance in tolerances:
+                    rows = []
+                    for distance_px in distances_px:
+                        color = np.zeros((height, width, 3), np.float32)
+                        color[LAMP_Y_PX, EDGE_X_PX + distance_px - 1] = 1.0
+                        seen = filtered(
+                            *(eye_filter, color, depth_m.astype(np.float32)),
+                            *(camera, state),
+                            hidden=layer,
+                            render_tolerance=tolerance,
+                        )
+                        rows.append(seen.color.sum(axis=(0, 1), dtype=np.float64))
+                    exact = _visible_shares(
+                        *(eye_filter, camera, state, truth, distances_px),
+                        is_near if place == "behind" else np.zeros_like(is_near),
+                    )
+                    found[place, layers, tolerance] = LampEnergy(np.array(rows), exact)
+    return found
+
+
+def _visible_shares(eye_filter, camera, state, truth, distances_px, is_hidden):
+    """Return the shares (n, 3) of light that does not fall on hidden pixels.
+
+    Lamps are at most 0.2 degrees from the middle one, whose image they have.
+    """
+    lamps_px = [EDGE_X_PX + distance_px - 1 for distance_px in distances_px]
+    middle_px = lamps_px[len(lamps_px) // 2]
+    points = wavefronts_of(eye_filter, camera, middle_px, LAMP_Y_PX, state)
+    images = truth.images(points, max(SIZE_PX))
+    return np.array(
+        [
+            [1.0 - placed(i, x, LAMP_Y_PX, SIZE_PX)[is_hidden].sum() for i in images]
+            for x in lamps_px
+        ]
+    )
+
+
+CROP_FULL_PX, CROP_PX, CROP_AT_PX = (361, 241), (223, 163), (67, 35)
+"""Size of a full frame, and size and place of a window in it."""
+
+CROP_STATE = PointState(4.3, 0.5, 0.5)
+
+
+def crop_error_db(eye_name: str, engine: str, *, tolerance: float, mode: str) -> float:
+    """Return the PSNR of a window's frame against the same part of the full frame.
+
+    Pixels nearer to the border of the window than light reaches are left out.  Linear
+    light, with 1 as its peak.
+    """
+    full = camera_around(0.0, 0.0, CROP_FULL_PX)
+    view = picture(full)
+    (x, y), (width, height) = CROP_AT_PX, CROP_PX
+    left, right, up, down = full.tangents
+    across = (right - left) / full.width_px, (up - down) / full.height_px
+    window = Camera(
+        width,
+        height,
+        (
+            *(left + across[0] * x, left + across[0] * (x + width)),
+            *(up - across[1] * y, up - across[1] * (y + height)),
+        ),
+    )
+    part = slice(y, y + height), slice(x, x + width)
+    seen = []
+    for camera, place in ((full, (slice(None), slice(None))), (window, part)):
+        with opened(eye_name, camera, engine, mode=mode) as eye_filter:
+            found = filtered(
+                *(eye_filter, np.ascontiguousarray(view.color[place])),
+                *(np.ascontiguousarray(view.depth_m[place]), camera, CROP_STATE),
+                render_tolerance=tolerance,
+            )
+            # The lens is relaxed or focused; the farthest and the nearest point.
+            reach_px = max(
+                point.spot_px() + EDGE_REACH_PX
+                for object_dpt in (1.0 / view.depth_m.max(), 1.0 / view.depth_m.min())
+                for point in wavefronts_of(
+                    *(eye_filter, camera, width // 2, height // 2),
+                    replace(CROP_STATE, object_dpt=float(object_dpt)),
+                )
+            )
+        seen.append(found.color.astype(np.float64))
+    border = math.ceil(reach_px)
+    inner = slice(border, height - border), slice(border, width - border)
+    difference = (seen[0][part] - seen[1])[inner]
+    if not difference.size:
+        raise ValueError(f"light reaches {border} px: the window has none left")
+    return float(-10.0 * np.log10(max(np.mean(difference**2), 1e-30)))
+
+
+EDGE_REACH_PX = 12.0
+"""Distance from the rays at which kernels of 99 % of the light have ended."""
+
+
+def picture(camera: Camera) -> RgbdView:
+    """Return a photograph with depth in linear light, in a camera's view."""
+    size = camera.width_px, camera.height_px
+    color, depth_m = motorcycle(2 * size[0], 2 * size[1])
+    color, depth_m = (
+        np.ascontiguousarray(image[: 2 * size[1] : 2, : 2 * size[0] : 2])
+        for image in (color, depth_m)
+    )
+    light = linear_from_srgb(color).astype(np.float32)
+    return RgbdView(light, depth_m, camera.tangents, "radial")
+
+
+LAMP_LIGHT = 20.0
+LAMP_AT_PX = {"sampled": (32, 120), "not sampled": (35, 117)}
+"""Place of a lamp, among the pixels from which the white level is found, and not."""
+
+FAR_PX = 180
+
+
+def far_change(
+    eye_name: str, engine: str, truth: PointTruth, *, tolerance: float, at: str
+) -> float:
+    """Return the largest change of pixels from `FAR_PX` on by a lamp at the left.
+
+    The lamp's own light by the reference is subtracted.
+    """
+    camera = camera_around(0.0, 0.0, CROP_FULL_PX)
+    view = picture(camera)
+    (x, y), seen = LAMP_AT_PX[at], []
+    with opened(eye_name, camera, engine, mode="dynamic") as eye_filter:
+        for light in (view.color[y, x].copy(), LAMP_LIGHT):
+            color = view.color.copy()
+            color[y, x] = light
+            found = filtered(
+                *(eye_filter, color, view.depth_m, camera, CROP_STATE),
+                render_tolerance=tolerance,
+            )
+            seen.append(found.color.astype(np.float64))
+        state = replace(CROP_STATE, object_dpt=1.0 / float(view.depth_m[y, x]))
+        points = wavefronts_of(eye_filter, camera, x, y, state)
+    own = [
+        placed(image, x, y, CROP_FULL_PX)
+        for image in truth.images(points, max(CROP_FULL_PX))
+    ]
+    change = seen[1] - seen[0]
+    change -= np.stack(own, axis=-1) * (LAMP_LIGHT - view.color[y, x])
+    return float(np.abs(change[:, FAR_PX:]).max())
