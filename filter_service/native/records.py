@@ -105,6 +105,7 @@ class Frame(c.Structure):
         ("largest_reach_px", c.c_float),
         ("fragments", POINTER),
         ("lights", POINTER),
+        ("blend_shares", POINTER),
         ("boxes", POINTER * 4),
         ("blocks", POINTER),
         ("fragment_count", c.c_int64),

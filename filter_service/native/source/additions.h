@@ -127,6 +127,7 @@ INLINE int prepare_addition(const frame *f, uint32_t index, float share, depth_g
     reading r = start_reading(one, image, own);
     meeting m = meet(&r, own);
     if (m.pairs <= 0 || m.rows <= 0) return 0;
+    if (f->blend_shares != NULL) share *= f->blend_shares[index];
     float scale = image->scale * share;
     float red = scale * light->rgb[0], green = scale * light->rgb[1];
     float blue = scale * light->rgb[2], excess = scale * light->excess;

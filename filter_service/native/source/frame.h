@@ -142,6 +142,7 @@ typedef struct {
     float largest_reach_px;
     fragment *fragments;      /* block_slots per block; no gaps in a row of blocks */
     fragment_light *lights;
+    float *blend_shares;      /* of each fragment; NULL if pixels do not blend cells */
     int16_t *boxes[4];        /* first and last columns and rows that fragments light */
     block_info *blocks;
     int64_t fragment_count, merged_count;

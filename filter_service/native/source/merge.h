@@ -113,11 +113,8 @@ INLINE void write_blended(const block *b, int i, const origin *pixel, block_info
     int interval = position_interval(f, pixel->place);
     for (int j = 0; j < count; ++j) {
         origin own = *pixel;
-        float share = parts[j].share;
         own.kernel = f->kernel_of[parts[j].cell * f->interval_count + interval];
-        own.color *= (f32x4){share, share, share, 1.0f};
-        own.coverage *= share;
-        own.strength *= share;
+        f->blend_shares[info->end] = parts[j].share;
         write_fragment(b, i, &own, info->end++);
     }
 }

@@ -447,6 +447,9 @@ class FrameRecord:
         n_blocks *= c.surface_count
         c.fragments = self._buffer("fragments", n_blocks * c.block_slots, FRAGMENT)
         c.lights = self._buffer("lights", n_blocks * c.block_slots, FRAGMENT_LIGHT)
+        if c.blend_column:
+            count = n_blocks * c.block_slots
+            c.blend_shares = self._buffer("blend_shares", count, np.float32)
         n_places = n_blocks * c.block_slots + BOX_PADDING_COUNT
         for side in range(4):
             c.boxes[side] = self._buffer(f"boxes {side}", n_places, np.int16)
