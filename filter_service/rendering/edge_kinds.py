@@ -181,19 +181,20 @@ def _object_dpt(
     return 1.0 / depth_m
 
 
-BLUR_STEP, BLUR_UNIT_PX = 0.05, 10.0
-"""Sources share a kernel of light if their blur differs by less than 5 % or 0.5 px."""
+KIND_STEP_PX = 0.5
+"""Sources share a kernel of light if the blur of their distances differs by less in the
+largest pupil.  Kinds depend on no state, so that none changes while the pupil does."""
 
 MAX_KINDS, MAX_KINDS_PX = 24, 40_000
 """Maximum number of kinds, and of the pixels of their kernels.  If there are more, the
 kinds are selected so that the brightest sources are similar to one of them."""
 
 MAX_CANDIDATES = 64
-"""Number of kinds to select from: those with the most light per pixel."""
+"""Number of kinds to select from: those with the most light."""
 
 SIMILAR_STEPS = 5
-"""Maximum difference in rows, columns or steps of blur at which a source uses the near
-light of another kind.  Sources that differ more have distant light only."""
+"""Maximum difference in rows, columns or steps of distance at which a source uses the
+near light of another kind.  Sources that differ more have distant light only."""
 
 END_PX = 6.0
 """Estimated distance from the rays of the spot to the end of a kernel."""
@@ -255,7 +256,7 @@ class SourceKinds:
     is_similar : (m,)
         Whether a source is similar enough to its kind to use the kind's near light.
     place : (n, 3)
-        Row and column of the cell, and blur in steps.
+        Row and column of the cell, and distance in steps.
     cell, interval, layer_dpt : (n,)
     part_ratio : (n,)
         Position within the interval of layers, 0 to 1.
@@ -271,22 +272,22 @@ class SourceKinds:
 
     @classmethod
     def of(cls, state: EyeAtFrame, pixels: BrightPixels) -> SourceKinds:
-        """Sort sources by their cell and blur."""
+        """Sort sources by their cell and distance."""
         layers, image = state.layers, state.image
         row, column, change_dpt = state.cells_at(*pixels.source_at_px.T)
         cell = row * image.grid[0] + column
-        vergence_dpt = np.asarray(layers.vergence.vergence_dpt(pixels.object_dpt))
-        steps_dpt = layers.layer_dpt
-        layer_dpt = np.clip(
-            np.clip(vergence_dpt, *layers.vergence_range_dpt) + change_dpt,
-            steps_dpt[0],
-            steps_dpt[-1],
+        vergence_dpt = np.clip(
+            layers.vergence.vergence_dpt(pixels.object_dpt), *layers.vergence_range_dpt
         )
+        steps_dpt = layers.layer_dpt
+        layer_dpt = np.clip(vergence_dpt + change_dpt, steps_dpt[0], steps_dpt[-1])
         node = image.nodes[cell, image.weight_ratio[cell].argmax(axis=1)]
         total_dpt = layer_dpt + layers.layer_zero_dpt[node, GREEN]
         blur_px = layers.blur_px_per_dpt * np.abs(total_dpt)
-        blur = np.arcsinh(blur_px * np.sign(total_dpt) / BLUR_UNIT_PX) / BLUR_STEP
-        key = np.stack([row, column, np.rint(blur).astype(np.int64)], axis=-1)
+        store = state.handle.store
+        widest_px = store.spec.blur_px_per_dpt(float(store.plan.pupils_mm[-1]))
+        distance = np.rint(vergence_dpt * widest_px / KIND_STEP_PX).astype(np.int64)
+        key = np.stack([row, column, distance], axis=-1)
         place, of_source = np.unique(key, axis=0, return_inverse=True)
         of_source = of_source.reshape(-1)
         brightness = pixels.light.sum(axis=1)
@@ -349,7 +350,7 @@ def _kept(
     kernel_px = (3.0 * np.sqrt(2.0) * (blur_px + END_PX)) ** 2
     if len(place) <= MAX_KINDS and kernel_px.sum() <= MAX_KINDS_PX:
         return np.arange(len(place))
-    brightness = (light / kernel_px).astype(np.float32)
+    brightness = light.astype(np.float32)  # not per pixel, as blur follows the state
     candidates = np.argsort(-brightness, kind="stable")[:MAX_CANDIDATES]
     difference = np.abs(place[candidates, None] - place).max(axis=2)
     # How well the kernel of a candidate represents each kind: 1 for its own, 0 for

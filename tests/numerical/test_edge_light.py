@@ -13,7 +13,12 @@ from filter_service.planning.plan import plan_cache
 from filter_service.psfs.eye_for_spec import eye_for_spec
 from filter_service.psfs.store import PsfStore
 from filter_service.rendering import edge_kinds, edge_light
-from filter_service.rendering.edge_kinds import FADE_WHITE
+from filter_service.rendering.edge_kinds import (
+    FADE_WHITE,
+    BrightPixels,
+    EyeAtFrame,
+    SourceKinds,
+)
 from filter_service.rendering.edge_light import EdgeLight
 from filter_service.rendering.engine import ViewRequest
 from filter_service.rendering.frame import white_level
@@ -383,6 +388,29 @@ def test_shared_kernels_and_merged_pixels_are_near_the_exact_sum(
     room = exact.max(axis=2) < 1.0
     error = np.sqrt(np.mean((limited - exact)[room] ** 2))
     assert error <= 0.15 * np.sqrt(np.mean((exact - plain)[room] ** 2))
+
+
+@pytest.mark.parametrize("n_lamps", [40, 400])
+def test_lamps_share_the_same_kernels_in_all_states(engine, rng, n_lamps):
+    """Otherwise their light jumps when one changes its kind."""
+    bench = bench_of(engine)
+    color = np.full((HEIGHT, WIDTH, 3), 0.4, np.float32)
+    at = rng.integers(0, HEIGHT * WIDTH, n_lamps)
+    color.reshape(-1, 3)[at] = rng.uniform(20.0, 600.0, (n_lamps, 1))
+    depth_m = rng.uniform(0.4, 4.0, (HEIGHT, WIDTH)).astype(np.float32)
+    kinds = []
+    for pupil_mm, focus_dpt in ((4.0, 0.5), (4.0, 0.6), (4.4, 0.6)):
+        request = request_of(bench, color, depth_m, focus_dpt)
+        state = State(pupil_mm, focus_dpt)
+        pixels = BrightPixels.of(request.view, 0.4)
+        kinds.append(
+            SourceKinds.of(EyeAtFrame.of(replace(request, state=state)), pixels)
+        )
+    first = kinds[0]
+    assert len(first.place) > 3
+    for other in kinds[1:]:
+        np.testing.assert_array_equal(other.of_source, first.of_source)
+        np.testing.assert_array_equal(other.place, first.place)
 
 
 @pytest.mark.parametrize(("diffraction", "rings"), [(False, None), (True, "rings")])
