@@ -277,6 +277,13 @@ nodes averages such differences.  At 5 mm over the field of the demo, the PSNR a
 the image with all maps is 63 to 69 dB (cataract, myopia, keratoconus), and blending
 takes half of the time."""
 
+MIN_SHIFT_FADE_PX = 0.5
+MIN_SHIFT_FADE_RATIO = 0.03
+"""Above these limits, maps fade in: they are applied in full at this much more."""
+
+KERNEL_TAIL_PX = 2.0
+"""Light that a map displaces reaches about this far beyond the spread of a kernel."""
+
 MAP_ROUNDING_PX = 1e-4
 """Tolerance with which a mapped reach ends on a pixel, for sums in 32-bit floats."""
 

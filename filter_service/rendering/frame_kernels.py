@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from filter_service.camera import Camera
-from filter_service.constants import RECIPE_WORDS, RGB
+from filter_service.constants import FIELD_CORNERS, RECIPE_WORDS, RGB
 from filter_service.native import loops, records
 from filter_service.native.records import pointers
 from filter_service.psfs.frame_layers import FrameLayers, frame_layers
@@ -80,12 +80,13 @@ class FrameKernels:
         The pair of each kernel.
     parts : (n, 3)
         Node kernels whose weighted sum is the kernel.
-    weight_ratio : (n, 3)
-        Weight of each part.  If its map rotates or shears, the weight is multiplied by
-        the area of a mapped pixel over the area of a box with its sides.
-    maps : (n, 3, 2, 2)
-        Linear maps from offsets in pixels of the image to pixels of the part; the exact
-        identity where the difference is negligible.
+    weight_ratio : (n, 2, 3)
+        Weight of each part at both ends of the interval.  If its map rotates or shears,
+        the weight is multiplied by the area of a mapped pixel over the area of a box
+        with its sides.
+    maps : (n, 2, 3, 2, 2)
+        Linear maps from offsets in pixels of the image to pixels of the part, at both
+        ends; the exact identity where the difference is negligible.
     reach_px : (n, 4)
         Left, right, up, down.
     radius_px : (n,)
@@ -154,9 +155,9 @@ def frame_kernels(
         "near_spread_px": nodes.recipe_spread_px[nodes.near],
         "far_spread_px": nodes.recipe_spread_px[nodes.far],
     }
-    found = {
-        "weight_ratio": np.empty(parts.shape),
-        "maps": np.empty((*parts.shape, 2, 2)),
+    found: dict[str, NDArray[Any]] = {
+        "weight_ratio": np.empty((cells.size, 2, FIELD_CORNERS)),
+        "maps": np.empty((cells.size, 2, FIELD_CORNERS, 2, 2)),
         "reach_px": np.zeros((cells.size, 4), np.int64),
         "radius_px": np.zeros(cells.size, np.int64),
         "peak_ratio": np.zeros(cells.size),

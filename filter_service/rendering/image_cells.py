@@ -53,7 +53,7 @@ class CellMaps:
     """Maps of cells, each to its three field nodes.
 
     A part of a kernel is resampled by its map only if the map changes it noticeably,
-    see `MIN_SHIFT_RATIO`.
+    and in part if it is close to that, see `MIN_SHIFT_RATIO`.
 
     Attributes
     ----------

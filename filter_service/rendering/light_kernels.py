@@ -114,7 +114,7 @@ def omitted_shares(
     ----------
     own : (n,)
         Kinds to use.
-    maps : (n, 3, 2, 2)
+    maps : (n, 2, 3, 2, 2)
         Maps to the pixels of stored kernels, see `FrameKernels`.
     reach_px : (n,)
         Largest reach of each kernel.

@@ -7,9 +7,12 @@ the passes that plan kernels, and of the layers' distances.
 import numpy as np
 
 from filter_service.constants import (
+    KERNEL_TAIL_PX,
     MAX_LEVEL,
     MAX_REACH_PX,
     MERGE_MIN_SPREAD_PX,
+    MIN_SHIFT_FADE_PX,
+    MIN_SHIFT_FADE_RATIO,
     MIN_SHIFT_PX,
     MIN_SHIFT_RATIO,
     NO_LEVEL,
@@ -91,6 +94,15 @@ def map_tables(node_from_cell):
     )
 
 
+def needed_maps(maps, spread_px):
+    """Maps as far as kernels (...) of a spread need them."""
+    change = map_tables(maps)[-1]
+    shift_px = change * (spread_px + KERNEL_TAIL_PX)
+    share = np.clip((change - MIN_SHIFT_RATIO) / MIN_SHIFT_FADE_RATIO, 0.0, 1.0)
+    share *= np.clip((shift_px - MIN_SHIFT_PX) / MIN_SHIFT_FADE_PX, 0.0, 1.0)
+    return np.eye(2) + share[..., None, None] * (maps - np.eye(2))
+
+
 def mapped_sizes(inverse, stretch, is_moved, reach_px, radius_px):
     """Reaches (n, 3, 4) and radii (n, 3) of parts in the image's pixels."""
     row, corner = np.nonzero(is_moved)
@@ -122,27 +134,35 @@ def frame_kernels(store, layers, image, used):
     parts = parts.reshape(wanted.shape)
     nodes = node_kernels(store, layers, *np.divmod(pairs, n_intervals))
     spread_px = nodes["recipe_spread_px"][np.stack([nodes["near"], nodes["far"]], -1)]
-    maps = image.maps.node_from_cell[cells]
-    inverse, area, box, stretch, change = map_tables(maps)
-    is_moved = (change > MIN_SHIFT_RATIO) & (
-        change * nodes["radius_px"][parts] > MIN_SHIFT_PX
+    ends = []
+    for end in range(2):
+        maps = needed_maps(image.maps.node_from_cell[cells], spread_px[parts, end])
+        inverse, area, box, stretch, change = map_tables(maps)
+        reach_px, radius_px = mapped_sizes(
+            inverse,
+            stretch,
+            change > 0.0,
+            nodes["reach_px"][parts],
+            nodes["radius_px"][parts],
+        )
+        ends.append((maps, weights * box, area, reach_px, radius_px))
+    maps, weight_ratio, area, reach_px, radius_px = (
+        np.stack(values, axis=1) for values in zip(*ends, strict=True)
     )
-    area = np.where(is_moved, area, 1.0)
-    reach_px, radius_px = mapped_sizes(
-        inverse, stretch, is_moved, nodes["reach_px"][parts], nodes["radius_px"][parts]
-    )
-    in_use = weights > 0.0
-    spreads_px = spread_px[parts] * (weights / np.sqrt(area))[..., None]
+    spreads_px = np.moveaxis(spread_px[parts], -1, 1) * weights[:, None]
+    in_use = (weights > 0.0)[:, None]
     return nodes, {
         "cells": cells,
         "intervals": intervals,
         "parts": parts,
-        "weight_ratio": weights * np.where(is_moved, box, 1.0),
-        "maps": np.where(is_moved[..., None, None], maps, np.eye(2)),
-        "reach_px": np.where(in_use[..., None], reach_px, 0).max(axis=1),
-        "radius_px": np.where(in_use, radius_px, 0).max(axis=1),
-        "peak_ratio": (nodes["peak_ratio"][parts] * weights * area).sum(axis=1),
-        "spread_px": spreads_px.sum(axis=1),
+        "weight_ratio": weight_ratio,
+        "maps": maps,
+        "reach_px": np.where(in_use[..., None], reach_px, 0).max(axis=(1, 2)),
+        "radius_px": np.where(in_use, radius_px, 0).max(axis=(1, 2)),
+        "peak_ratio": (nodes["peak_ratio"][parts] * weights * area.max(axis=1)).sum(
+            axis=1
+        ),
+        "spread_px": (spreads_px / np.sqrt(area)).sum(axis=-1),
     }
 
 

@@ -9,6 +9,7 @@ import pytest
 from estimator.profiles.measured_wavefront import MeasuredWavefront
 from estimator.profiles.parse import parse_profile
 from filter_service.constants import RECIPE_TAPS, RGB
+from filter_service.native import loops, records
 from filter_service.planning.plan import unchecked_plan
 from filter_service.psfs.frame_layers import frame_layers
 from filter_service.psfs.pack import PackedKernels, layer_blur_px
@@ -224,3 +225,55 @@ def test_maps_and_their_ratios(rng):
     np.testing.assert_array_equal(found.node_from_cell, maps)
     for made, plain in zip(found[1:], plan_twin.map_tables(maps), strict=True):
         np.testing.assert_allclose(made, plain, rtol=1e-11, atol=1e-13)
+
+
+def maps_of_kernels(maps, spread_px):
+    """Maps (n, 2, 3, 2, 2) of kernels, each of one cell and of parts of one spread."""
+    n = len(maps)
+    tables = CellMaps(maps).tables
+    inputs = {
+        "cell_weight_ratio": np.full((n, 3), 1.0 / 3.0),
+        "cells": np.arange(n),
+        "parts": np.repeat(np.arange(n)[:, None], 3, axis=1),
+        "node_reach_px": np.full((n, 4), 5),
+        "node_radius_px": np.full(n, 5),
+        "node_peak_ratio": np.ones(n),
+        "near_spread_px": spread_px,
+        "far_spread_px": spread_px + 0.5,
+    }
+    found = {
+        "weight_ratio": np.empty((n, 2, 3)),
+        "maps": np.empty((n, 2, 3, 2, 2)),
+        "reach_px": np.zeros((n, 4), np.int64),
+        "radius_px": np.zeros(n, np.int64),
+        "peak_ratio": np.zeros(n),
+        "spread_px": np.zeros((n, 2)),
+    }
+    inputs = {name: np.ascontiguousarray(values) for name, values in inputs.items()}
+    job = records.SizeJob(
+        cell_maps=records.MapTables(**records.pointers(**tables._asdict())),
+        count=n,
+        **records.pointers(**inputs, **found),
+    )
+    loops().call("fill_sizes", job)
+    return found["maps"]
+
+
+@pytest.mark.parametrize("by", ["spread", "map"])
+def test_maps_fade_in(by):
+    """Over the spread of the kernels, and over the size of the map."""
+    share = np.linspace(0.0, 1.0, 4001)
+    change = np.full_like(share, 0.2) if by == "spread" else 0.4 * share
+    maps = np.eye(2) + np.einsum("n,ij->nij", change, [[1.0, 0.0], [0.0, 0.0]])
+    maps = np.repeat(maps[:, None], 3, axis=1)
+    spread_px = 10.0 * share if by == "spread" else np.full_like(share, 10.0)
+    found = maps_of_kernels(maps, spread_px)
+    is_whole = (found == maps[:, None]).all(axis=(2, 3, 4))
+    is_unmoved = (found == np.eye(2)).all(axis=(2, 3, 4))
+    assert is_unmoved.any()
+    assert is_whole[-1].all()
+    step = np.abs(np.diff(found, axis=0)).max()
+    assert step < 2e-3  # at once, it would be 0.1 at least
+    # the far end of an interval is the near end of the next one
+    if by == "spread":
+        np.testing.assert_allclose(found[200:, 0], found[:-200, 1], atol=1e-12)

@@ -76,22 +76,20 @@ def kernel_pairs(store: PsfStore, kernels: FrameKernels) -> NDArray[np.float64]:
     ends = np.stack([of_recipe[nodes.near], of_recipe[nodes.far]], axis=1)
     out = np.zeros((kernels.count, *ends.shape[1:]))
     for k in range(kernels.count):
-        for corner in np.flatnonzero(kernels.weight_ratio[k] > 0.0):
-            part = ends[kernels.parts[k, corner]]
-            out[k] += kernels.weight_ratio[k, corner] * _mapped(
-                part, kernels.maps[k, corner]
+        for end, corner in np.argwhere(kernels.weight_ratio[k] > 0.0):
+            part = ends[kernels.parts[k, corner], end]
+            out[k, end] += kernels.weight_ratio[k, end, corner] * _mapped(
+                part, kernels.maps[k, end, corner]
             )
     return out
 
 
 def _mapped(stored: NDArray, to_stored: NDArray) -> NDArray[np.float64]:
-    """Return the light (2, size, size, 3) of stored pixels that each pixel covers."""
+    """Return the light (size, size, 3) of stored pixels that each pixel covers."""
     if np.array_equal(to_stored, np.eye(2)):
         return stored
-    radius = stored.shape[1] // 2
-    sums = (
-        np.pad(stored, ((0, 0), (1, 0), (1, 0), (0, 0))).cumsum(axis=1).cumsum(axis=2)
-    )
+    radius = len(stored) // 2
+    sums = np.pad(stored, ((1, 0), (1, 0), (0, 0))).cumsum(axis=0).cumsum(axis=1)
     y, x = np.mgrid[-radius : radius + 1, -radius : radius + 1]
     middle = np.einsum("ij,jyx->iyx", to_stored, np.stack([x, y])) + radius + 0.5
     half = np.abs(np.diag(to_stored))[:, None, None] / 2.0
@@ -101,23 +99,20 @@ def _mapped(stored: NDArray, to_stored: NDArray) -> NDArray[np.float64]:
         """Return the light up to a point, bilinear in the sums over whole pixels."""
         return np.stack(
             [
-                [
-                    map_coordinates(
-                        end[..., channel], (rows, columns), order=1, mode="nearest"
-                    )
-                    for channel in range(3)
-                ]
-                for end in sums
-            ]
+                map_coordinates(
+                    sums[..., channel], (rows, columns), order=1, mode="nearest"
+                )
+                for channel in range(3)
+            ],
+            axis=-1,
         )
 
-    light = (
+    return (
         within(bottom, right)
         - within(bottom, left)
         - within(top, right)
         + within(top, left)
     )
-    return np.moveaxis(light, 1, -1)
 
 
 def cell_index(

@@ -31,7 +31,7 @@ typedef struct {
     const double *weight_ratio;                 /* (count, 3) */
     const double *layer_dpt, *layer_ratio;      /* (count, 2) */
     const double *zero_dpt;   /* (n_fields, 3) */
-    const double *maps;       /* (count, 3, 2, 2), as in FrameKernels */
+    const double *maps;       /* (count, 2, 3, 2, 2), as in FrameKernels */
     const int64_t *reach_px;  /* (count,) */
     float *omitted;           /* (count, 3, side, side) */
     int64_t side, count;

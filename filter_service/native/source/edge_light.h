@@ -204,11 +204,13 @@ static void omit_channel(void *argument, int item, int thread) {
             double total_dpt = job->layer_dpt[layer] + job->zero_dpt[RGB * node + channel];
             channel_taps(&job->tables, reads, node, (int)channel, total_dpt, uppers, psfs,
                          weights);
+            int64_t part = FIELD_CORNERS * layer + j - FIELD_CORNERS * n;
+            const double *map = job->maps + 4 * part;
             for (int64_t tap = 0; tap < 2 * reads->count; ++tap) {
                 double share =
                     weights[tap] * job->weight_ratio[j] * job->layer_ratio[layer];
                 if (share != 0.0)
-                    subtract_box(job->maps + 4 * j, job->tables.reach_words[psfs[tap]], half,
+                    subtract_box(map, job->tables.reach_words[psfs[tap]], half,
                                  around, share, omitted);
             }
         }

@@ -160,7 +160,7 @@ typedef struct {
     float *recipe_texels;
     const int64_t *kernel_cells, *kernel_parts;    /* (n), (n, 3) */
     const int64_t *node_near, *node_far;
-    const double *part_weights, *part_maps;        /* (n, 3), (n, 3, 2, 2) */
+    const double *part_weights, *part_maps;        /* (n, 2, 3), (n, 2, 3, 2, 2) */
     kernel_image *kernels;
     uint32_t *kernel_texels;
     float *blend_scratch;

@@ -4,6 +4,7 @@
 
 #include <math.h>
 
+#include "cell_maps.h"
 #include "frame.h"
 #include "vectors.h"
 
@@ -17,10 +18,6 @@ typedef struct {
     float *texels[MAX_LEVEL + 1];
     float largest[MAX_LEVEL + 1];
 } kernel_end;
-
-INLINE int is_unmoved(const double *map) {
-    return map[0] == 1.0 && map[1] == 0.0 && map[2] == 0.0 && map[3] == 1.0;
-}
 
 /* Reach in image pixels of a kernel stored in other pixels; twin: cell_maps.mapped_reach. */
 static reach mapped_reach(const double *map, reach stored) {
@@ -178,8 +175,8 @@ static float largest_of(const float *texels, size_t count) {
 }
 
 /* Box of a kernel's end: the union of the boxes of its mapped parts. */
-static reach end_box(const frame *f, int kernel, const int *recipes, int r) {
-    const double *maps = f->part_maps + 4 * FIELD_CORNERS * (size_t)kernel;
+static reach end_box(const frame *f, int kernel, int is_far, const int *recipes, int r) {
+    const double *maps = f->part_maps + 4 * first_part(kernel, is_far);
     reach box = {0, 0, 0, 0};
     for (int j = 0; j < FIELD_CORNERS; ++j) {
         if (recipes[j] < 0) continue;
@@ -191,8 +188,8 @@ static reach end_box(const frame *f, int kernel, const int *recipes, int r) {
 
 /* Computes the kernel of a cell at one layer, unless `end` already holds it. */
 static void make_end(const frame *f, int kernel, int is_far, int r, kernel_end *end) {
-    const double *weights = f->part_weights + FIELD_CORNERS * (size_t)kernel;
-    const double *maps = f->part_maps + 4 * FIELD_CORNERS * (size_t)kernel;
+    const double *weights = f->part_weights + first_part(kernel, is_far);
+    const double *maps = f->part_maps + 4 * first_part(kernel, is_far);
     int recipes[FIELD_CORNERS];
     kernel_recipes(f, kernel, is_far, recipes);
     if (end->cell == f->kernel_cells[kernel]
@@ -202,7 +199,7 @@ static void make_end(const frame *f, int kernel, int is_far, int r, kernel_end *
     end->cell = f->kernel_cells[kernel];
     memcpy(end->recipes, recipes, sizeof recipes);
     memcpy(end->maps, maps, sizeof end->maps);
-    reach box = end->box = end_box(f, kernel, recipes, r);
+    reach box = end->box = end_box(f, kernel, is_far, recipes, r);
     size_t count = (size_t)reach_width(box) * (size_t)reach_height(box);
     memset(end->texels[0], 0, sizeof(float) * 4 * count);
     for (int j = 0; j < FIELD_CORNERS; ++j) {

@@ -49,7 +49,7 @@ typedef struct {
     const int64_t *cells, *parts;               /* (count,), (count, 3) */
     const int64_t *node_reach_px, *node_radius_px;  /* of node kernels: (m, 4), (m,) */
     const double *node_peak_ratio, *near_spread_px, *far_spread_px;
-    double *weight_ratio, *maps;                /* (count, 3), (count, 3, 2, 2) */
+    double *weight_ratio, *maps;                /* (count, 2, 3), (count, 2, 3, 2, 2) */
     int64_t *reach_px, *radius_px;              /* (count, 4), (count,) */
     double *peak_ratio, *spread_px;             /* (count,), (count, 2) */
     int64_t count;

@@ -76,37 +76,39 @@ static int64_t fill_recipes(recipe_job *job) {
     return n_missing;
 }
 
-/* Writes the map and weight of part j of kernel k, and widens the kernel. */
-INLINE void fill_part(const size_job *job, int64_t k, int64_t j) {
-    const map_tables *maps = &job->cell_maps;
-    int64_t at = FIELD_CORNERS * k + j, part = job->parts[at];
+/* Writes the map and weight of part j of kernel k at one end of its interval, and widens the
+ * kernel.  Returns the area ratio of the map. */
+INLINE double fill_end(const size_job *job, int64_t k, int64_t j, int end) {
+    int64_t part = job->parts[FIELD_CORNERS * k + j];
     int64_t corner = FIELD_CORNERS * job->cells[k] + j;
+    int64_t at = FIELD_CORNERS * (2 * k + end) + j;
     double weight = job->cell_weight_ratio[corner];
+    double spread_px = (end ? job->far_spread_px : job->near_spread_px)[part];
+    cell_map own = needed_map(&job->cell_maps, corner, spread_px);
+    memcpy(job->maps + 4 * at, own.out, sizeof own.out);
+    job->weight_ratio[at] = weight * own.box_ratio;
+    job->spread_px[2 * k + end] += spread_px * weight / sqrt(own.area_ratio);
+    if (!(weight > 0.0)) return own.area_ratio;
     int64_t side_px[4], widest_px = job->node_radius_px[part];
     memcpy(side_px, job->node_reach_px + 4 * part, sizeof side_px);
-    double area = 1.0, box = 1.0;
-    double *own = job->maps + 4 * at;
-    if (needs_map(maps->change_ratio[corner], widest_px)) {
-        memcpy(own, maps->node_from_cell + 4 * corner, 4 * sizeof *own);
-        area = maps->area_ratio[corner];
-        box = maps->box_ratio[corner];
-        map_reach(maps->cell_from_node + 4 * corner, side_px);
-        double wider_px = maps->stretch_ratio[corner] * ((double)widest_px + 1.0);
+    if (!is_unmoved(own.out)) {
+        map_reach(own.back, side_px);
+        double wider_px = own.stretch_ratio * ((double)widest_px + 1.0);
         widest_px = (int64_t)at_most(ceil(wider_px), MAX_REACH_PX);
-    } else {
-        own[0] = own[3] = 1.0;
-        own[1] = own[2] = 0.0;
     }
-    job->weight_ratio[at] = weight * box;
-    job->peak_ratio[k] += job->node_peak_ratio[part] * weight * area;
-    double share = weight / sqrt(area);
-    job->spread_px[2 * k] += job->near_spread_px[part] * share;
-    job->spread_px[2 * k + 1] += job->far_spread_px[part] * share;
-    if (!(weight > 0.0)) return;
     if (widest_px > job->radius_px[k]) job->radius_px[k] = widest_px;
     for (int side = 0; side < 4; ++side)
         if (side_px[side] > job->reach_px[4 * k + side])
             job->reach_px[4 * k + side] = side_px[side];
+    return own.area_ratio;
+}
+
+/* Adds part j to kernel k. */
+INLINE void fill_part(const size_job *job, int64_t k, int64_t j) {
+    double area = at_least(fill_end(job, k, j, 0), fill_end(job, k, j, 1));
+    double weight = job->cell_weight_ratio[FIELD_CORNERS * job->cells[k] + j];
+    int64_t part = job->parts[FIELD_CORNERS * k + j];
+    job->peak_ratio[k] += job->node_peak_ratio[part] * weight * area;
 }
 
 /* Writes the maps, weights and sizes of kernels; these arrays are zero before. */

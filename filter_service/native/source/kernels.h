@@ -23,7 +23,7 @@ static void place_kernels(frame *f) {
             int near[FIELD_CORNERS], far[FIELD_CORNERS];
             kernel_recipes(f, k, 0, near);
             kernel_recipes(f, k, 1, far);
-            boxes[r] = wider(end_box(f, k, near, r), end_box(f, k, far, r));
+            boxes[r] = wider(end_box(f, k, 0, near, r), end_box(f, k, 1, far, r));
         }
         for (int level = 0; level <= MAX_LEVEL; ++level) {
             if (!(shape->levels_used & (1 << level))) continue;

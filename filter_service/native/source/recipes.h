@@ -27,10 +27,15 @@ static int resolutions_used(const frame *f, int kernel) {
     return bits;
 }
 
+/* Number of a kernel's first part at one end. */
+INLINE size_t first_part(int kernel, int is_far) {
+    return FIELD_CORNERS * (2 * (size_t)kernel + (size_t)is_far);
+}
+
 /* Recipes of a kernel's end; -1 for parts of zero weight. */
 INLINE void kernel_recipes(const frame *f, int kernel, int is_far, int *recipes) {
     const int64_t *parts = f->kernel_parts + FIELD_CORNERS * (size_t)kernel;
-    const double *weights = f->part_weights + FIELD_CORNERS * (size_t)kernel;
+    const double *weights = f->part_weights + first_part(kernel, is_far);
     for (int j = 0; j < FIELD_CORNERS; ++j)
         recipes[j] = weights[j] > 0.0 ? (int)(is_far ? f->node_far : f->node_near)[parts[j]] : -1;
 }
