@@ -30,7 +30,8 @@ FRAGMENT_LIGHT = np.dtype(
     [
         ("rgb", "<f4", 3),
         ("depth", "<f4"),
-        ("share", "<f4"),
+        ("strength", "<f4"),
+        ("coverage", "<f4"),
         ("excess", "<f4"),
     ]
 )

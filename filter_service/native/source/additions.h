@@ -130,12 +130,8 @@ INLINE int prepare_addition(const frame *f, uint32_t index, float share, depth_g
     if (f->blend_shares != NULL) share *= f->blend_shares[index];
     float scale = image->scale * share;
     float red = scale * light->rgb[0], green = scale * light->rgb[1];
-    float blue = scale * light->rgb[2], excess = scale * light->excess;
-    float strength = scale * light->share, coverage = scale;
-    if (is_hidden(f, index)) {
-        coverage = strength;
-        strength = 0.0f;
-    }
+    float blue = scale * light->rgb[2], strength = scale * light->strength;
+    float coverage = scale * light->coverage, excess = scale * light->excess;
     light_raster(own);
     a->to = own->pairs + (m.row + r.top) * own->stride + m.pair;
     a->to_stride = own->stride;

@@ -53,7 +53,8 @@ typedef struct {
 typedef struct {
     float rgb[RGB];           /* times the coverage */
     float depth;              /* sort depth, smaller is nearer */
-    float share;              /* strength of an edge; on the hidden surface, coverage */
+    float strength;           /* of an edge of the visible surface, 0 to 1 */
+    float coverage;           /* less than 1 if hidden in part, or one cell's part of a pixel */
     float excess;             /* light that missing coverage does not amplify */
 } fragment_light;
 

@@ -14,7 +14,7 @@ typedef struct {
     float place;
     uint32_t kernel;
     int level, is_edge;
-    float share;              /* as of the fragment's light */
+    float strength, coverage; /* as of the fragment's light */
 } origin;
 
 /* Mean over the square that starts at a pixel. */
@@ -28,14 +28,17 @@ INLINE float square_mean(const float *pixels, int i, int level) {
 INLINE origin origin_of(const block *b, const block_squares *all, int i, int level) {
     int is_edge = (b->edges & square_pixels[level] << i) != 0;
     float share = is_edge ? square_mean(b->share, i, level) : 0.0f;
+    float strength = b->surface == 0 ? share : 0.0f;
+    float coverage = b->surface == 0 ? 1.0f : share;
     if (level == 0)
         return (origin){{b->rgb[0][i], b->rgb[1][i], b->rgb[2][i], b->dpt[i]},
-                        b->place[i], b->kernel[i], 0, is_edge, share};
+                        b->place[i], b->kernel[i], 0, is_edge, strength, coverage};
     const square_row *s = &all->rows[level - 1][i / TILE_SIZE_PX >> level];
     int lane = i % TILE_SIZE_PX;
     return (origin){{lane_of(&s->mean[0], lane), lane_of(&s->mean[1], lane),
                      lane_of(&s->mean[2], lane), lane_of(&s->dpt, lane)},
-                    lane_of(&s->place, lane), all->kernel[i], level, is_edge, share};
+                    lane_of(&s->place, lane), all->kernel[i], level, is_edge, strength,
+                    coverage};
 }
 
 /* Sort depth; smaller is nearer. */
@@ -70,11 +73,12 @@ INLINE void write_fragment(const block *b, int i, const origin *from, uint32_t a
     float depth = sort_depth(f, x, y, from->color[3]);
     uint32_t state = from->kernel | (uint32_t)level << LEVEL_SHIFT
                      | (from->is_edge ? EDGE_BIT : 0u);
-    float excess = 0.0f, coverage = b->surface > 0 ? from->share : 1.0f;
+    float excess = 0.0f;
     for (int c = 0; c < RGB; ++c)
-        excess += larger_float(from->color[c] - b->bright[c] * coverage, 0.0f);
+        excess += larger_float(from->color[c] - b->bright[c] * from->coverage, 0.0f);
     f->lights[at] = (fragment_light){{from->color[0], from->color[1], from->color[2]},
-                                     depth, from->share, excess * (1.0f / RGB)};
+                                     depth, from->strength, from->coverage,
+                                     excess * (1.0f / RGB)};
     f->fragments[at] = (fragment){(uint16_t)x, (uint16_t)y, state,
                                   (uint16_t)(fraction * 65535.0f + 0.5f),
                                   (uint16_t)(shape->radius_px + beyond)};
