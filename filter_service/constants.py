@@ -132,6 +132,11 @@ of the next level under twice the spread is the same image, twice as large."""
 
 MERGE_CONTRAST_POWER = 1.5
 
+MERGE_FADE_RATIO = 0.1
+"""Squares that miss a limit of merging by less than this ratio do not merge, but their
+pixels are moved toward the mean of the square, the more the less they miss it: no
+square merges at once."""
+
 MERGE_MIDTONE = 0.2
 MERGE_DARKEST = 0.0155
 """In an image encoded for a display, dark parts need finer steps: below a fifth of

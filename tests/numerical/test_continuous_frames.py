@@ -101,3 +101,23 @@ def test_a_lamp_beside_an_edge_has_the_energy_of_its_visible_part(
         visible = alone if is_near else alone[:, WIDTH // 2 :]
         assert is_near or visible.sum() < 0.99 * alone.sum()
         assert beside.sum() == pytest.approx(visible.sum(), rel=0.02)
+
+
+def test_squares_merge_gradually(bench, rng):
+    """With pixels of two colors, all squares reach the limit of contrast together."""
+    sign = rng.choice([-0.5, 0.5], (HEIGHT, WIDTH, 1))
+
+    def rendered(contrast):
+        color = (0.5 + contrast * sign).repeat(3, axis=2).astype(np.float32)
+        view = bench.view(color, 1.0 / 3.0, "radial")
+        return bench.render(view, **STATE, white_level=1.0)
+
+    low, high = 0.0, 0.5
+    assert rendered(low).merged_count > rendered(high).merged_count
+    for _ in range(12):
+        middle = (low + high) / 2.0
+        is_merged = rendered(middle).merged_count > WIDTH * HEIGHT / 2
+        low, high = (middle, high) if is_merged else (low, middle)
+    below, above = rendered(low), rendered(high)
+    assert below.merged_count > above.merged_count + WIDTH * HEIGHT / 2
+    assert np.abs(above.color.astype(float) - below.color).max() < 3e-4

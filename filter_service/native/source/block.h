@@ -120,7 +120,7 @@ INLINE void read_row(block *b, int i, size_t first, int width) {
         float change_px = shape->spread_px[1] - shape->spread_px[0];
         f32x4 color = pixel_color(f, b->surface, first + (size_t)x);
         if (b->surface > 0) {
-            b->share[i] = hidden_coverage(f, seen_dpt[x], dpt[x]);
+            b->share[i] = f->paper_rule ? 1.0f : hidden_coverage(f, seen_dpt[x], dpt[x]);
             color *= all4(b->share[i]);
         }
         for (int c = 0; c < RGB; ++c) b->rgb[c][i] = color[c];

@@ -6,6 +6,7 @@
 #define MAX_LEVEL 3
 #define DISCONTINUITY_PX 0.25f
 #define NEAREST_M 0.02f
+#define MERGE_FADE_RATIO 0.1f
 #define MERGE_MIDTONE 0.2f
 #define MERGE_DARKEST 0.0155f
 #define EDGE_MIX_COVERAGE 0.002f

@@ -5,9 +5,6 @@
 #include "frame.h"
 #include "vectors.h"
 
-/* Bit masks of the pixels of a square that starts at pixel 0. */
-static const uint64_t square_pixels[MAX_LEVEL + 1] = {1, 0x0303u, 0x0F0F0F0Fu, ~(uint64_t)0};
-
 /* Values of a pixel or square that becomes a fragment. */
 typedef struct {
     f32x4 color;              /* linear RGB, dpt */
@@ -136,9 +133,48 @@ INLINE uint64_t largest_squares(const block *b, block_squares *all) {
     return pixels;
 }
 
+INLINE void move_toward(float *value, float mean, float share) {
+    *value += share * (mean - *value);
+}
+
+/* Moves the pixels and merged squares of a square toward its mean. */
+static void fade_square(block *b, block_squares *all, uint64_t pixels, int i, int level) {
+    float share = all->fade[level][i];
+    square_row *s = &all->rows[level - 1][i / TILE_SIZE_PX >> level];
+    int lane = i % TILE_SIZE_PX;
+    float dpt = lane_of(&s->dpt, lane), place = lane_of(&s->place, lane);
+    uint64_t inside = square_pixels[level] << i;
+    for (uint64_t left = pixels & inside; left; left &= left - 1) {
+        int at = __builtin_ctzll(left);
+        for (int c = 0; c < RGB; ++c)
+            move_toward(b->rgb[c] + at, lane_of(&s->mean[c], lane), share);
+        move_toward(b->dpt + at, dpt, share);
+        move_toward(b->place + at, place, share);
+        b->kernel[at] = kernel_at(b, at, b->place[at]);
+    }
+    for (int below = 1; below < level; ++below)
+        for (uint64_t left = all->merged[below] & inside; left; left &= left - 1) {
+            int at = __builtin_ctzll(left), own = at % TILE_SIZE_PX;
+            square_row *part = &all->rows[below - 1][at / TILE_SIZE_PX >> below];
+            for (int c = 0; c < RGB; ++c)
+                move_toward((float *)&part->mean[c] + own, lane_of(&s->mean[c], lane), share);
+            move_toward((float *)&part->dpt + own, dpt, share);
+            move_toward((float *)&part->place + own, place, share);
+            all->kernel[at] = kernel_at(b, at, lane_of(&part->place, own));
+        }
+    if (!(b->edges & inside)) return;
+    float mean = square_mean(b->share, i, level);
+    for (uint64_t left = inside; left; left &= left - 1)
+        move_toward(b->share + __builtin_ctzll(left), mean, share);
+    b->edges |= inside;
+}
+
 /* Writes the fragments of a block in scan order. */
-static void write_block(const block *b, block_squares *all, block_info *info) {
+static void write_block(block *b, block_squares *all, block_info *info) {
     uint64_t pixels = largest_squares(b, all);
+    for (int level = 1; level <= MAX_LEVEL; ++level)
+        for (uint64_t left = all->fading[level]; left; left &= left - 1)
+            fade_square(b, all, pixels, __builtin_ctzll(left), level);
     uint64_t starts = pixels | all->merged[1] | all->merged[2] | all->merged[3];
     for (; starts; starts &= starts - 1) {
         int i = __builtin_ctzll(starts);

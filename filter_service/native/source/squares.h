@@ -1,8 +1,11 @@
-/* Merging of squares of 2, 4 and 8 similar pixels where blur hides the difference.  Twin:
- * merge_fragments.comp.glsl. */
+/* Merging of squares of 2, 4 and 8 similar pixels where blur hides the difference; squares that
+ * just miss a limit are moved toward their mean.  Twin: merge_fragments.comp.glsl. */
 
 #include "frame.h"
 #include "vectors.h"
+
+/* Bit masks of the pixels of a square that starts at pixel 0. */
+static const uint64_t square_pixels[MAX_LEVEL + 1] = {1, 0x0303u, 0x0F0F0F0Fu, ~(uint64_t)0};
 
 /* Adjacent squares in eight lanes: those of 2^n pixels fill 2^n lanes each. */
 typedef struct {
@@ -16,6 +19,8 @@ typedef struct {
 typedef struct {
     square_row rows[MAX_LEVEL][TILE_SIZE_PX / 2];  /* of level 1 and higher */
     uint64_t merged[MAX_LEVEL + 1];
+    uint64_t fading[MAX_LEVEL + 1];          /* that miss a limit, but not by far */
+    float fade[MAX_LEVEL + 1][BLOCK_PIXELS]; /* of these: share of the way to their mean */
     uint32_t kernel[BLOCK_PIXELS];           /* of the largest square that starts there */
 } block_squares;
 
@@ -70,9 +75,17 @@ INLINE f32x8 seen_contrast(const frame *f, const square_row *s, int c) {
     return contrast / root8(smaller8(larger8(light, all8(MERGE_DARKEST)), all8(1.0f)));
 }
 
-/* Bit mask of the squares that blur allows to merge into one fragment.  Relative to twice
- * the blur, a square of the next level looks the same, and so does its error. */
-INLINE uint32_t similar_lanes(const block *b, const square_row *s, int level) {
+/* How far a value is from missing its limit by MERGE_FADE_RATIO, from 1 at the limit to 0.  The
+ * margin is never 0, so that equal values below a limit of 0 are at 1. */
+INLINE f32x8 fade_lanes(f32x8 value, f32x8 limit) {
+    f32x8 margin = all8(MERGE_FADE_RATIO) * limit + all8(1e-30f);
+    return (limit - value) / margin + all8(1.0f);
+}
+
+/* Bit mask of the squares that blur allows to merge into one fragment, and how far each may be
+ * moved toward its mean (`fade`, up to 1 and more).  Relative to twice the blur, a square of the
+ * next level looks the same, and so does its error. */
+INLINE uint32_t similar_lanes(const block *b, const square_row *s, int level, f32x8 *fade) {
     const frame *f = b->f;
     f32x8 spread = s->spread_px * all8(1.0f / (float)(1 << (level - 1)));
     f32x8 contrast = seen_contrast(f, s, 0);
@@ -80,9 +93,15 @@ INLINE uint32_t similar_lanes(const block *b, const square_row *s, int level) {
     f32x8 most = all8(b->tolerance * f->white_level * MERGE_CONTRAST) * spread * root8(spread);
     f32x8 step = larger8(all8(MERGE_MAX_BLUR_STEP_PX), all8(MERGE_MAX_BLUR_RATIO) * s->spread_px);
     f32x8 blur_px = (s->most_dpt - s->least_dpt) * all8(f->blur_px_per_dpt);
-    i32x8 intervals = whole8(s->farthest) - whole8(s->nearest);
-    return bits_of8((spread >= all8(b->smallest_spread_px)) & (contrast <= most)
-                    & (blur_px <= all8(b->tolerance) * step) & (intervals <= 1));
+    f32x8 most_px = all8(b->tolerance) * step;
+    /* Farther apart, there may be no kernel between them. */
+    i32x8 near = whole8(s->farthest) - whole8(s->nearest) <= 1;
+    f32x8 least = all8(b->smallest_spread_px);
+    f32x8 smallest = (spread - least) / (all8(MERGE_FADE_RATIO) * least) + all8(1.0f);
+    smallest = smaller8(smallest, fade_lanes(contrast, most));
+    smallest = smaller8(smallest, fade_lanes(blur_px, most_px));
+    *fade = (f32x8)((i32x8)smallest & near);
+    return bits_of8((spread >= least) & (contrast <= most) & (blur_px <= most_px) & near);
 }
 
 INLINE float lane_of(const f32x8 *lanes, int lane) { return ((const float *)lanes)[lane]; }
@@ -110,11 +129,34 @@ INLINE uint64_t starts_of_four(uint64_t below, int level) {
     return pairs & pairs >> (side * TILE_SIZE_PX) & grid[level];
 }
 
+/* The smallest fade of the four squares of the level below; 1 for merged ones, and pixels. */
+INLINE float part_fade(const block_squares *all, int i, int level) {
+    float least = 1.0f;
+    if (level == 1) return least;
+    for (int part = 0; part < 4; ++part) {
+        int at = i + (part & 1) * (1 << (level - 1)) + (part >> 1) * (TILE_SIZE_PX << (level - 1));
+        if (!(all->merged[level - 1] >> at & 1))
+            least = smaller_float(all->fade[level - 1][at], least);
+    }
+    return least;
+}
+
+/* How far the coverage of a hidden square allows its merging: it must be visible in full. */
+INLINE float coverage_fade(const block *b, int i, int level) {
+    float least = 1.0f;
+    if (b->surface == 0) return least;
+    for (uint64_t left = square_pixels[level] << i; left; left &= left - 1)
+        least = smaller_float(b->share[__builtin_ctzll(left)], least);
+    return 1.0f - (1.0f - least) * (1.0f / MERGE_FADE_RATIO);
+}
+
 /* Merges squares of the level below; the compiler generates a loop for each level. */
-INLINE uint64_t merge_level(const block *b, block_squares *all, uint64_t below, int level) {
+INLINE void merge_level(const block *b, block_squares *all, int level) {
+    uint64_t whole = level == 1 ? b->held : all->merged[level - 1];
+    uint64_t below = level == 1 ? b->held : all->merged[level - 1] | all->fading[level - 1];
     uint64_t starts = starts_of_four(below, level);
-    if (starts == 0) return 0;
-    uint64_t similar = 0;
+    if (starts == 0) return;
+    uint64_t similar = 0, near = 0;
     for (int row = 0; row < TILE_SIZE_PX >> level; ++row) {
         square_row *to = &all->rows[level - 1][row];
         if (level == 1) {
@@ -124,21 +166,34 @@ INLINE uint64_t merge_level(const block *b, block_squares *all, uint64_t below, 
             const square_row *from = &all->rows[level - 2][2 * row];
             join_rows(from, from + 1, level, to);
         }
-        similar |= (uint64_t)similar_lanes(b, to, level) << (row * TILE_SIZE_PX << level);
+        int first = row * TILE_SIZE_PX << level;
+        f32x8 fade;
+        similar |= (uint64_t)similar_lanes(b, to, level, &fade) << first;
+        near |= (uint64_t)bits_of8(fade > all8(0.0f)) << first;
+        store8(all->fade[level] + first, fade);
     }
-    uint64_t merged = 0;
-    for (uint64_t left = starts & similar; left; left &= left - 1) {
+    uint64_t full = similar & starts_of_four(whole, level);
+    for (uint64_t left = starts & (near | similar); left; left &= left - 1) {
         int i = __builtin_ctzll(left);
+        uint64_t bit = left & -left;
         const square_row *s = &all->rows[level - 1][i / TILE_SIZE_PX >> level];
-        if (take_square(b, all, s, i, level)) merged |= (uint64_t)1 << i;
+        float fade = coverage_fade(b, i, level);
+        if (full & bit && fade >= 1.0f) {
+            if (take_square(b, all, s, i, level)) all->merged[level] |= bit;
+            continue;
+        }
+        if (b->f->paper_rule) continue;
+        fade = smaller_float(fade, smaller_float(all->fade[level][i], part_fade(all, i, level)));
+        all->fade[level][i] = fade;
+        if (fade > 0.0f) all->fading[level] |= bit;
     }
-    return merged;
 }
 
 /* Merges a block as far as its kernels and `highest` allow. */
 INLINE void merge_squares(const block *b, int highest, block_squares *all) {
     memset(all->merged, 0, sizeof all->merged);
-    if (highest > 0) all->merged[1] = merge_level(b, all, b->held, 1);
-    if (highest > 1) all->merged[2] = merge_level(b, all, all->merged[1], 2);
-    if (highest > 2) all->merged[3] = merge_level(b, all, all->merged[2], 3);
+    memset(all->fading, 0, sizeof all->fading);
+    if (highest > 0) merge_level(b, all, 1);
+    if (highest > 1) merge_level(b, all, 2);
+    if (highest > 2) merge_level(b, all, 3);
 }

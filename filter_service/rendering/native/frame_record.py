@@ -12,6 +12,7 @@ from numpy.typing import DTypeLike, NDArray
 from filter_service.constants import (
     FIELD_CORNERS,
     MAX_LEVEL,
+    MERGE_FADE_RATIO,
     MIN_BLUR_RANGE,
     MIN_SPREAD_PX,
     TILE_SIZE_PX,
@@ -264,7 +265,8 @@ def _shapes(kernels: FrameKernels, merge_spread_px: float) -> NDArray[np.void]:
     shapes["radius_px"] = kernels.radius_px
     shapes["reach_px"] = kernels.reach_px
     widest_px = np.maximum(kernels.spread_px.max(axis=1), MIN_SPREAD_PX)
-    steps = np.floor(np.log2(widest_px / merge_spread_px)) + 1
+    least_px = (1.0 - MERGE_FADE_RATIO) * merge_spread_px
+    steps = np.floor(np.log2(widest_px / least_px)) + 1
     shapes["highest_level"] = np.clip(steps, 0, MAX_LEVEL)
     return shapes
 
