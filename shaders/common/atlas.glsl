@@ -26,13 +26,18 @@ uvec4 pack_weights(vec3 near, vec3 far, float scale) {
 
 vec3 near_weights(uvec4 texel) { return vec3(texel.rgb & WEIGHT_MASK); }
 
-// Weights interpolated between the two ends, in steps.  A step number in the low bits of
-// 2^23 is the float 2^23 plus that number, so no conversion is needed; a GPU has a lower
-// throughput of conversions than of additions.
-vec3 weights_between(uvec4 texel, float fraction) {
+// Sum of the weights at both ends, in steps, times factors.  On a GPU, a step number in the
+// low bits of 2^23 is the float 2^23 plus that number: it has a lower throughput of
+// conversions than of additions.
+vec3 weights_between(uvec4 texel, vec2 factors) {
+#ifdef ATLAS_IS_BUFFER
     vec3 near = uintBitsToFloat((texel.rgb & WEIGHT_MASK) | uint(EXACT_FLOAT_BITS));
     vec3 far = uintBitsToFloat((texel.rgb >> WEIGHT_BITS) | uint(EXACT_FLOAT_BITS));
-    return (near - EXACT_FLOAT) + fraction * (far - near);
+    return factors.x * (near - EXACT_FLOAT) + factors.y * (far - EXACT_FLOAT);
+#else
+    return factors.x * vec3(ivec3(texel.rgb & WEIGHT_MASK))
+         + factors.y * vec3(ivec3(texel.rgb >> WEIGHT_BITS));
+#endif
 }
 
 vec3 far_weights(uvec4 texel) { return vec3(texel.rgb >> WEIGHT_BITS); }

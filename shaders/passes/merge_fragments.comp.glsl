@@ -1,6 +1,8 @@
 // Merges similar pixels where the blur hides the difference: 2 x 2, then 4 x 4, then the
 // whole block.  Packs the fragments of each 8 x 8 block, in scan order, to the front of
 // the block's slots.  One surface per dispatch; surfaces never merge with each other.
+// The members of a square that just fails to merge are moved toward its mean, so that the
+// frame does not jump when it merges.
 // The hidden surface makes fragments only where an edge of the visible one is in reach.
 // In:  PIXELS, PIXEL_LAYER, KERNELS, KERNEL_OF (kernel of a cell and interval), PLAN,
 //      BLOCK_LIGHT; for the hidden surface, BLOCKS of the visible one.
@@ -51,13 +53,16 @@ shared uint block_has_edge;
 shared uint block_merged_count;
 shared uint edge_in_reach;
 shared vec3 usual_light;          // above which a pixel's light is in excess
-// The merged square whose first quad is the thread's.
-shared int level_of[QUADS];       // 0: single pixels; -1: the quad is part of another square
-shared vec4 mean[QUADS];          // linear RGB, dpt
-shared vec4 low[QUADS];
-shared vec4 high[QUADS];
-shared vec4 positions[QUADS];     // in layers: mean, nearest, farthest; least spread px
-shared float edge_of[QUADS];      // mean strength or coverage
+// Squares of all levels: quads, their squares, the block.
+const int SQUARES = QUADS + QUADS / int(QUAD) + 1;
+shared uint merges[SQUARES];      // whether the square is one fragment
+shared float fade[SQUARES];       // share by which members move to the mean; -1 if one of
+                                  // them does not exist
+shared vec4 mean[SQUARES];        // linear RGB, dpt
+shared vec4 low[SQUARES];
+shared vec4 high[SQUARES];
+shared vec4 positions[SQUARES];   // in layers: mean, nearest, farthest; least spread px
+shared float edge_of[SQUARES];    // mean strength or coverage
 
 // Pixels of the thread's quad.
 vec4 values[int(QUAD)];           // linear RGB, dpt
@@ -76,17 +81,21 @@ float beyond_surface(float change_dpt) {
     return clamp(change_dpt * blur_px_per_dpt / DISCONTINUITY_PX - 1.0, 0.0, 1.0);
 }
 
-// How clearly a neighbor lies on another surface, as seen through this pupil.
-float edge_strength(ivec2 at, float dpt) {
-    const ivec2 steps[] = ivec2[](ivec2(1, 0), ivec2(-1, 0), ivec2(0, 1), ivec2(0, -1));
-    float most_dpt = 0.0;
-    for (int i = 0; i < steps.length(); ++i) {
-        ivec2 other = at + steps[i];
-        if (inside(other))
-            most_dpt = max(most_dpt, abs(pixels[pixel_index(other)].a - dpt));
+// Largest step of vergence from pixel i of the quad at `at` to its neighbors: the two in the
+// quad, and those on the other sides.
+float largest_step_dpt(ivec2 at, int i) {
+    float dpt = values[i].a;
+    float most = 0.0;
+    for (int axis = 0; axis < 2; ++axis) {
+        int bit = 1 << axis;
+        ivec2 outward = ivec2(0);
+        outward[axis] = (i & bit) != 0 ? 1 : -1;
+        ivec2 other = at + ivec2(i & 1, i >> 1) + outward;
+        if (inside(at + ivec2(i & 1, i >> 1) - outward))
+            most = max(most, abs(values[i ^ bit].a - dpt));
+        if (inside(other)) most = max(most, abs(pixels[pixel_index(other)].a - dpt));
     }
-    float strength = beyond_surface(most_dpt);
-    return strength * strength;
+    return most;
 }
 
 // Coverage of a hidden pixel: 0 where it is so close to the surface in front of it that the
@@ -106,10 +115,8 @@ void find_usual_light(ivec2 block, ivec2 grid) {
     usual_light = EXCESS_RATIO * sum.rgb / sum.a;
 }
 
-// Kernel of a pixel's cell at a layer position, and the fraction of its interval.
-uint kernel_at(ivec2 at, float place, out float fraction) {
-    int interval = position_interval(place, layer_count);
-    fraction = place - float(interval);
+// Kernel of a pixel's cell at an interval of layers.
+uint kernel_in(ivec2 at, int interval) {
     return kernel_of[cell_of(at) * interval_count(layer_count) + interval];
 }
 
@@ -118,14 +125,17 @@ uint read_pixels(ivec2 at) {
     uint held = 0u;
     for (int i = 0; i < int(QUAD); ++i) {
         ivec2 member = at + ivec2(i & 1, i >> 1);
+        edges_of[i] = 0.0;
         if (!inside(member) || (surface != 0 && edge_in_reach == 0u)) continue;
-        vec4 value = pixels[pixel_index(member)];
-        float edge = surface == 0 ? edge_strength(member, value.a)
-                                  : hidden_coverage(member, value.a);
-        if (surface != 0 && paper_order == 0) value.rgb *= edge;
-        values[i] = value;
-        edges_of[i] = edge;
-        if (surface == 0 || edge > 0.0) held |= 1u << uint(i);
+        values[i] = pixels[pixel_index(member)];
+        if (surface != 0) edges_of[i] = hidden_coverage(member, values[i].a);
+        if (surface == 0 || edges_of[i] > 0.0) held |= 1u << uint(i);
+    }
+    for (int i = 0; i < int(QUAD); ++i) {
+        if (surface == 0) {
+            float strength = beyond_surface(largest_step_dpt(at, i));
+            edges_of[i] = strength * strength;
+        } else if (paper_order == 0) values[i].rgb *= edges_of[i];
     }
     return held;
 }
@@ -155,30 +165,39 @@ vec3 seen_contrast(vec3 least, vec3 most) {
     return (most - least) / sqrt(clamp(light, MERGE_DARKEST, 1.0));
 }
 
-// Whether four squares of the level below may become one fragment.  Relative to a blur of
-// twice the size, a square of the next level is the same, and so is its error.
-bool is_similar(ivec2 at, int level, vec4 least, vec4 most, vec4 place) {
+// 1 where a value is at most its limit; 0 where it is beyond by a part of the limit.
+float share_within(float value, float limit) {
+    float width = max(MERGE_FADE_RATIO * abs(limit), MIN_BLUR_RANGE);
+    return clamp(1.0 - (value - limit) / width, 0.0, 1.0);
+}
+
+// Whether all positions lie in neighboring intervals, so that the kernel of any position
+// between them is one of theirs.
+bool are_neighbors(vec4 place) { return floor(place.z) - floor(place.y) <= 1.0; }
+
+// 1 where four squares of the level below are so alike that they may become one fragment;
+// 0 where they clearly are not.  Relative to a blur of twice the size, a square of the next
+// level is the same, and so is its error.
+float similarity(int level, vec4 least, vec4 most, vec4 place) {
     float spread = place.w / float(1 << (level - 1));
     vec3 contrast = seen_contrast(least.rgb, most.rgb);
     float largest = max(contrast.r, max(contrast.g, contrast.b));
-    float fraction;
-    uint kernel = kernel_at(at, place.x, fraction);
-    // At most neighboring intervals, so that the kernel of the mean is one of theirs.
-    return spread >= smallest_spread_px(gain)
-        && floor(place.z) - floor(place.y) <= 1.0
-        && largest <= gain * tolerance * white_level * MERGE_CONTRAST
-                      * pow(spread, MERGE_CONTRAST_POWER)
-        && (most.a - least.a) * blur_px_per_dpt
-           <= gain * tolerance * max(MERGE_MAX_BLUR_STEP_PX, MERGE_MAX_BLUR_RATIO * place.w)
-        && kernel_has_level(kernel, level);
+    float most_contrast = gain * tolerance * white_level * MERGE_CONTRAST
+                        * pow(spread, MERGE_CONTRAST_POWER);
+    float most_step = gain * tolerance
+                    * max(MERGE_MAX_BLUR_STEP_PX, MERGE_MAX_BLUR_RATIO * place.w);
+    float share = share_within(-spread, -smallest_spread_px(gain));
+    share = min(share, share_within(largest, most_contrast));
+    share = min(share, share_within((most.a - least.a) * blur_px_per_dpt, most_step));
+    return paper_order == 0 ? share : floor(share);
 }
 
 // Position of a pixel, three times, and the spread of its kernel.
 vec4 pixel_place(ivec2 at) {
     float place = position[pixel_index(at)];
-    float fraction;
-    uint kernel = kernel_at(at, place, fraction);
-    return vec4(place, place, place, kernel_spread_px(kernel, fraction));
+    int interval = position_interval(place, layer_count);
+    float spread_px = kernel_spread_px(kernel_in(at, interval), place - float(interval));
+    return vec4(place, place, place, spread_px);
 }
 
 // Adds a member to the sum, the extremes and the positions of a square.
@@ -192,18 +211,33 @@ void take_in(vec4 value, vec4 least, vec4 most, vec4 place, bool is_first, inout
                       max(all_places.z, place.z), min(all_places.w, place.w));
 }
 
-void keep_square(uint quad, int level, vec4 sum, vec4 least, vec4 most, vec4 place, float edge) {
-    mean[quad] = sum / QUAD;
-    low[quad] = least;
-    high[quad] = most;
-    positions[quad] = place;
-    edge_of[quad] = edge / QUAD;
-    level_of[quad] = level;
+// Index of the square of a level at a pixel of the block.
+int square_of(ivec2 local, int level) {
+    int first = level == 1 ? 0 : level == 2 ? QUADS : SQUARES - 1;
+    return first + (local.y >> level) * (TILE_SIZE_PX >> level) + (local.x >> level);
+}
+
+// Decides about a square of four members, by the smallest of their shares and whether all
+// of them are single fragments.
+void keep_square(ivec2 at, int square, int level, float share, bool are_single, vec4 sum,
+                 vec4 least, vec4 most, vec4 place, float edge) {
+    place.x = clamp(place.x / QUAD, place.y, place.z);
+    mean[square] = sum / QUAD;
+    low[square] = least;
+    high[square] = most;
+    positions[square] = place;
+    edge_of[square] = edge / QUAD;
+    share *= similarity(level, least, most, place);
+    fade[square] = share;
+    int interval = position_interval(place.x, layer_count);
+    bool is_alike = share == 1.0 && are_single && are_neighbors(place);
+    merges[square] = is_alike && kernel_has_level(kernel_in(at, interval), level) ? 1u : 0u;
 }
 
 // Merges the thread's own quad, if all its pixels exist and are alike.
-void merge_pixels(ivec2 at, uint quad, uint held) {
-    level_of[quad] = 0;
+void merge_pixels(ivec2 at, int quad, uint held) {
+    merges[quad] = 0u;
+    fade[quad] = -1.0;
     if (max_level == 0 || held != (1u << uint(QUAD)) - 1u) return;
     float edge = 0.0;
     vec4 sum, least, most, place;
@@ -213,27 +247,58 @@ void merge_pixels(ivec2 at, uint quad, uint held) {
                 place);
         edge += edges_of[i];
     }
-    place.x /= QUAD;
-    if (is_similar(at, 1, least, most, place))
-        keep_square(quad, 1, sum, least, most, place, edge);
+    keep_square(at, quad, 1, 1.0, true, sum, least, most, place, edge);
 }
 
 // Merges four squares of the level below, the first of which starts at this quad.
-void merge_squares(ivec2 at, uint quad, int level) {
-    uint side = 1u << uint(level - 2);
+void merge_squares(ivec2 at, ivec2 local, int level) {
     float edge = 0.0;
+    float share = 1.0;
+    uint single = 1u;
     vec4 sum, least, most, place;
-    uvec4 members = quad + side * uvec4(0u, 1u, QUADS_ACROSS, QUADS_ACROSS + 1);
     for (int i = 0; i < int(QUAD); ++i) {
-        uint m = members[i];
-        if (level_of[m] != level - 1) return;
+        ivec2 step = ivec2(i & 1, i >> 1) << (level - 1);
+        int m = square_of(local + step, level - 1);
         take_in(mean[m], low[m], high[m], positions[m], i == 0, sum, least, most, place);
         edge += edge_of[m];
+        share = min(share, fade[m]);
+        single &= merges[m];
     }
-    place.x /= QUAD;
-    if (!is_similar(at, level, least, most, place)) return;
-    for (int i = 1; i < int(QUAD); ++i) level_of[members[i]] = -1;
-    keep_square(quad, level, sum, least, most, place, edge);
+    int square = square_of(local, level);
+    merges[square] = 0u;
+    fade[square] = -1.0;
+    if (share >= 0.0)
+        keep_square(at, square, level, share, single != 0u, sum, least, most, place, edge);
+}
+
+// Level of the fragment that a quad starts; 0: single pixels; -1: it is part of another.
+int fragment_level(ivec2 local) {
+    int level = 0;
+    for (int i = 1; i <= max_level; ++i)
+        if (merges[square_of(local, i)] != 0u) level = i;
+    bool is_first = all(equal(local & ((1 << level) - 1), ivec2(0)));
+    return is_first ? level : -1;
+}
+
+// How the squares around a fragment move it to their means: its values times `kept`, plus
+// the rest.
+struct Approach { float kept; vec4 value; float place; float edge; vec2 range; bool is_near; };
+
+Approach find_approach(ivec2 local, int level) {
+    Approach all = Approach(1.0, vec4(0.0), 0.0, 0.0, vec2(0.0), true);
+    for (int i = level + 1; i <= max_level; ++i) {
+        int square = square_of(local, i);
+        float share = fade[square];
+        if (share <= 0.0) continue;
+        vec4 place = positions[square];
+        all.kept *= 1.0 - share;
+        all.value = mix(all.value, mean[square], share);
+        all.place = mix(all.place, place.x, share);
+        all.edge = mix(all.edge, edge_of[square], share);
+        all.range = place.yz;
+        all.is_near = are_neighbors(place);
+    }
+    return all;
 }
 
 // Smaller is nearer.
@@ -244,9 +309,20 @@ float sort_depth(ivec2 at, float dpt) {
     return distance_m + PAPER_TIE_BREAK_M * scan;
 }
 
-Fragment make_fragment(ivec2 at, vec4 value, float place, int level, float edge) {
-    float fraction;
-    uint kernel = kernel_at(at, place, fraction);
+// A fragment as its square moves it.  Its kernel is that of an interval in which a member of
+// the square lies: others have none, if no pixel uses them.
+Fragment make_fragment(ivec2 at, vec4 value, float place, int level, float edge,
+                       Approach approach) {
+    int interval = position_interval(place, layer_count);
+    if (approach.kept < 1.0) {
+        value = approach.kept * value + approach.value;
+        edge = approach.kept * edge + approach.edge;
+        place = clamp(approach.kept * place + approach.place, approach.range.x,
+                      approach.range.y);
+        if (approach.is_near) interval = position_interval(place, layer_count);
+    }
+    float fraction = clamp(place - float(interval), 0.0, 1.0);
+    uint kernel = kernel_in(at, interval);
     vec3 excess = max(value.rgb - usual_light * (surface == 0 ? 1.0 : edge), 0.0);
     return Fragment(value.rgb, sort_depth(at, value.a), at, kernel, fraction,
                     kernel_radius_px(kernel), kernel_reach(kernel), level,
@@ -298,33 +374,37 @@ void main() {
     ivec2 local = 2 * ivec2(quad % uint(QUADS_ACROSS), quad / uint(QUADS_ACROSS));
     ivec2 at = block_at * TILE_SIZE_PX + local;
     uint held = read_pixels(at);  // a bit for each of the quad's pixels
-    merge_pixels(at, quad, held);
+    merge_pixels(at, int(quad), held);
     barrier();  // all quads are decided before they are read
     for (int level = 2; level <= max_level; ++level) {
-        if (all(equal(local & ((1 << level) - 1), ivec2(0)))) merge_squares(at, quad, level);
+        if (all(equal(local & ((1 << level) - 1), ivec2(0)))) merge_squares(at, local, level);
         barrier();  // the level is complete before the next one reads it
     }
-    int level = level_of[quad];
+    int level = fragment_level(local);
+    int square = square_of(local, max(level, 1));
     if (level > 0) {
-        note_survivor(pixel_bit(local), edge_of[quad]);
+        // The square takes the place of its first pixel.
+        held = 1u;
+        values[0] = mean[square];
+        edges_of[0] = edge_of[square];
         atomicAdd(block_merged_count, 1u << uint(2 * level));
     }
+    if (level < 0) held = 0u;
     for (int i = 0; i < int(QUAD); ++i) {
         ivec2 step = ivec2(i & 1, i >> 1);
-        if (level == 0 && (held & (1u << uint(i))) != 0u)
+        if ((held & (1u << uint(i))) != 0u)
             note_survivor(pixel_bit(local + step), edges_of[i]);
     }
     barrier();  // every survivor is counted before slots are assigned
 
-    if (level > 0)
-        write_fragment(block, pixel_bit(local),
-                       make_fragment(at, mean[quad], positions[quad].x, level, edge_of[quad]));
+    Approach approach = find_approach(local, max(level, 0));
     for (int i = 0; i < int(QUAD); ++i) {
         ivec2 step = ivec2(i & 1, i >> 1);
-        if (level == 0 && (held & (1u << uint(i))) != 0u)
-            write_fragment(block, pixel_bit(local + step),
-                           make_fragment(at + step, values[i], position[pixel_index(at + step)],
-                                         0, edges_of[i]));
+        if ((held & (1u << uint(i))) == 0u) continue;
+        float place = level > 0 ? positions[square].x : position[pixel_index(at + step)];
+        write_fragment(block, pixel_bit(local + step),
+                       make_fragment(at + step, values[i], place, max(level, 0), edges_of[i],
+                                     approach));
     }
     barrier();  // the largest reach is known
     if (quad == 0u) {

@@ -54,21 +54,20 @@ const int ENTRIES_PER_THREAD = BATCH / GROUP_THREADS;
 
 // Staged fragments: the data of the pixel loop, in as few words as possible, because each
 // word read costs a tenth of an evaluation on a software renderer.
-shared vec4 staged_color[BATCH];      // linear RGB, multiplied by the scale of the weights
-                                      // except for the paper's rule; layer fraction
+shared vec4 staged_color[BATCH];      // linear RGB; a third of the excess light
 shared uvec4 staged_mark[BATCH];      // x: lit columns and rows of the tile, a bit each;
                                       // level; length of the kernel's rows.  y: texel of
                                       // the tile's first pixel, as if lit.  z, w: bits of
-                                      // the scale of coverage, and of the scale times the
-                                      // excess light and a third.  Before staging x is the slot: with
-                                      // little shared memory many groups can run at once
+                                      // the factors of the kernel's two ends.  Before
+                                      // staging x is the slot: with little shared memory
+                                      // many groups can run at once
 #ifndef PAPER_RULE
 shared uint bright[HIT_WORDS];        // bit per staged fragment: it has excess light
 #endif
 #ifdef IN_ORDER
 shared vec2 staged_order[BATCH];      // group of depths plus the share of the next group;
-                                      // scale times a third of the strength of the edge,
-                                      // minus 1 for a hidden fragment
+                                      // a third of the strength of the edge, minus 1 for a
+                                      // hidden fragment
 #endif
 shared uint hits[HIT_WORDS];          // bit per entry of the batch: it reaches the tile
 
@@ -107,27 +106,28 @@ void stage(uint slot, int at, ivec2 tile_first) {
     uint rows = bits_between(first.y, last.y);
     float scale = kernel_scale(kernel, level) / WEIGHT_MAX;
     float excess = 0.0;
-#ifdef PAPER_RULE
-    vec3 light = color.rgb;
-#else
+#ifndef PAPER_RULE
     vec2 edge = edges[slot];
     bool is_hidden = slot >= uint(tile_grid.x * tile_grid.y * THREADS);
+    // The light of a hidden fragment is multiplied with its coverage, and the weights are, too.
+    if (is_hidden) {
+        scale *= edge.x;
+        color.rgb /= edge.x;
+        edge.y /= edge.x;
+    }
 #ifdef IN_ORDER
-    float strength = is_hidden ? -1.0 : scale * edge.x / float(RGB);
-    staged_order[at] = vec2(group_of(color.a), strength);
+    staged_order[at] = vec2(group_of(color.a), is_hidden ? -1.0 : edge.x / float(RGB));
 #endif
-    excess = scale * edge.y / float(RGB);
+    excess = edge.y / float(RGB);
     if (excess > 0.0)
         atomicOr(bright[at / BITS_PER_WORD], 1u << uint(at % BITS_PER_WORD));
-    vec3 light = color.rgb * scale;
-    if (is_hidden) scale *= edge.x;
 #endif
-    staged_color[at] = vec4(light, place_fraction(place));
+    staged_color[at] = vec4(color.rgb, excess);
+    vec2 factors = scale * vec2(1.0 - place_fraction(place), place_fraction(place));
     uint shape = columns | (rows << uint(ROWS_SHIFT))
                | (uint(level) << uint(SHAPE_LEVEL_SHIFT)) | (uint(width) << uint(WIDTH_SHIFT));
     int texel = int(kernel_offset(kernel, level)) - first.y * width - first.x;
-    staged_mark[at] = uvec4(shape, uint(texel), floatBitsToUint(scale),
-                            floatBitsToUint(excess));
+    staged_mark[at] = uvec4(shape, uint(texel), floatBitsToUint(factors));
 }
 
 // Bits, from 0 on, of this thread's entries of a batch that reach the tile.
@@ -244,16 +244,19 @@ uvec4 fetch_weights(uvec4 mark, ivec2 in_tile) {
     return ATLAS_FETCH(atlas, is_lit(mark, in_tile) ? texel : 0);
 }
 
-// Adds a fragment's light at a pixel by its weight.
+// Weights of a staged fragment at a pixel, zero if it is not lit.  Selected, not computed in
+// a branch: llvmpipe executes both sides of a branch and stores the result masked.
+vec3 weights_of(uvec4 ends, bool lit, uvec4 mark) {
+    return weights_between(ends, mix(vec2(0.0), uintBitsToFloat(mark.zw), bvec2(lit)));
+}
+
+// Adds a fragment's light at a pixel by its weights.
 void add_light(inout Sum sum, vec3 weight, vec4 color, uvec4 mark) {
-    float scale = uintBitsToFloat(mark.z);
 #ifdef PAPER_RULE
     int level = int(mark.x >> uint(SHAPE_LEVEL_SHIFT)) & LEVEL_MASK;
-    weight = paper_weight(weight * scale, sum.coverage, level);
-    sum.coverage += weight;
-#else
-    sum.coverage += weight * scale;
+    weight = paper_weight(weight, sum.coverage, level);
 #endif
+    sum.coverage += weight;
     sum.light += weight * color.rgb;
 }
 
@@ -273,8 +276,7 @@ void add_order(int p, vec3 weight, vec4 color, uvec4 mark, float strength) {
 #define STRENGTH_OF(at) 0.0
 #endif
 
-// Adds staged fragments to the current group: those from `at` to `end`.  A weight is selected
-// and not computed in a branch: llvmpipe executes both sides and stores the result masked.
+// Adds staged fragments to the current group: those from `at` to `end`.
 void add_fragments(int at, int end, ivec2 in_tile) {
 #if FRAGMENTS_A_TURN > 1
     // Several fetches in flight at a time.
@@ -289,9 +291,8 @@ void add_fragments(int at, int end, ivec2 in_tile) {
             uvec4 mark = staged_mark[at + n];
             float strength = STRENGTH_OF(at + n);
             for (int p = 0; p < PIXELS_PER_THREAD; ++p) {
-                bvec3 lit = bvec3(is_lit(mark, in_tile + ivec2(0, p)));
-                vec3 weight = weights_between(ends[n * PIXELS_PER_THREAD + p], color.a);
-                weight = mix(vec3(0.0), weight, lit);
+                bool lit = is_lit(mark, in_tile + ivec2(0, p));
+                vec3 weight = weights_of(ends[n * PIXELS_PER_THREAD + p], lit, mark);
                 add_light(open_sum[p], weight, color, mark);
                 add_order(p, weight, color, mark, strength);
             }
@@ -309,7 +310,7 @@ void add_fragments(int at, int end, ivec2 in_tile) {
         for (int p = 0; p < PIXELS_PER_THREAD; ++p) {
             bool lit = (rows & (1u << uint(p))) != 0u;
             uvec4 ends = ATLAS_FETCH(atlas, lit ? texel : 0);
-            vec3 weight = mix(vec3(0.0), weights_between(ends, color.a), bvec3(lit));
+            vec3 weight = weights_of(ends, lit, mark);
             add_light(open_sum[p], weight, color, mark);
             add_order(p, weight, color, mark, strength);
             texel += width;
@@ -335,16 +336,15 @@ int next_bright(int at, int end) {
 void add_excess(int at, int end, ivec2 in_tile, float open_group) {
     for (at = next_bright(at, end); at < end; at = next_bright(at + 1, end)) {
         uvec4 mark = staged_mark[at];
-        float fraction = staged_color[at].a;
-        float excess = uintBitsToFloat(mark.w);
+        float excess = staged_color[at].a;
 #ifdef IN_ORDER
         float share = clamp(staged_order[at].x - open_group, 0.0, 1.0);
         bool is_hidden = staged_order[at].y < 0.0;
 #endif
         for (int p = 0; p < PIXELS_PER_THREAD; ++p) {
             ivec2 here = in_tile + ivec2(0, p);
-            vec3 weight = weights_between(fetch_weights(mark, here), fraction);
-            float light = mix(0.0, dot(weight, vec3(excess)), is_lit(mark, here));
+            vec3 weight = weights_of(fetch_weights(mark, here), is_lit(mark, here), mark);
+            float light = dot(weight, vec3(excess));
             open_sum[p].excess += light;
 #ifdef IN_ORDER
             next_sum[p].excess += share * light;
@@ -373,7 +373,7 @@ void divide_fragments(int at, int end, ivec2 in_tile, float open_group) {
         for (int p = 0; p < PIXELS_PER_THREAD; ++p) {
             bool lit = (rows & (1u << uint(p))) != 0u;
             uvec4 ends = ATLAS_FETCH(atlas, lit ? texel : 0);
-            vec3 weight = mix(vec3(0.0), weights_between(ends, color.a), bvec3(lit));
+            vec3 weight = weights_of(ends, lit, mark);
             add_light(open_sum[p], weight, color, mark);
             add_light(next_sum[p], share * weight, color, mark);
             add_order(p, weight, color, mark, order.y);

@@ -3,9 +3,18 @@
 import numpy as np
 import pytest
 
-from filter_service.constants import DISCONTINUITY_PX
+from filter_service.constants import (
+    DISCONTINUITY_PX,
+    MERGE_CONTRAST,
+    MERGE_CONTRAST_POWER,
+    MERGE_FADE_RATIO,
+)
 from filter_service.rgbd_view import RgbdView
+from tests.numerical.made_fragments import made_fragments
+from tests.numerical.one_kernel import OneKernelBench, disc
 from tests.numerical.synthetic import Bench, texture
+
+pytestmark = pytest.mark.both_engines
 
 EMMETROPE = {"kind": "prescription", "sphere_dpt": 0.0}
 PURE = {"diffraction": False, "chromatic": False}
@@ -121,3 +130,29 @@ def test_squares_merge_gradually(bench, rng):
     below, above = rendered(low), rendered(high)
     assert below.merged_count > above.merged_count + WIDTH * HEIGHT / 2
     assert np.abs(above.color.astype(float) - below.color).max() < 3e-4
+
+
+@pytest.mark.gl
+@pytest.mark.parametrize("spread_px", [2.0, 4.0])
+def test_a_square_that_stops_merging_changes_no_pixel_at_once(gl_engine, spread_px):
+    """Pixels of two colors, whose contrast passes the limit of merging."""
+    bench = OneKernelBench(
+        gl_engine, disc(3), width_px=32, height_px=32, spread_px=spread_px
+    )
+    limit = MERGE_CONTRAST * spread_px**MERGE_CONTRAST_POWER
+
+    def frame(ratio):
+        color = np.full((32, 32, 3), 0.4, np.float32)
+        color[(X + Y)[:32, :32] % 2 == 0] += np.float32(ratio * limit)
+        color[:, 24:] = 1.0  # white
+        return bench.render(color, output="linear")
+
+    below, above = frame(1.0 - STEP_RATIO / 2.0), frame(1.0 + STEP_RATIO / 2.0)
+    assert above.merged_count < below.merged_count == 32 * 32
+    assert np.abs(above.color - below.color).max() < 0.5 * STEP_RATIO
+    for share in (0.1, 0.5, 1.0, 1.1):  # of the difference that is left
+        ratio = 1.0 + share * MERGE_FADE_RATIO
+        frame(ratio)
+        made = made_fragments(bench, 32, 32)
+        found = np.ptp(made.rgb[made.x < 24])
+        assert found == pytest.approx(min(share, 1.0) * ratio * limit, rel=0.01)
