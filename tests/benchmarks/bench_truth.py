@@ -7,8 +7,9 @@ exactly the pixel's direction, distance and state.  Frames have the tolerance 0 
 row says otherwise.  Writes results/truth.json.
 
 - point: half the sum of the absolute differences between the image of a pixel of light
-  1 and the reference, the worst color, at 12 directions and states.  On gray, points
-  are not bright; on black, they are, and light beyond kernels is added.
+  1 and the reference, the worst color, at 12 directions and states, each in the middle
+  of a window, and three of them in a wide frame.  On gray, points are not bright; on
+  black, they are, and light beyond kernels is added.
 - energy: largest difference of a point's light in the frame from 1.
 - step: errors of single steps of the way to a frame.  "Method" is the error of the
   program's PSFs of exactly the pixels; the others are differences from these PSFs.
@@ -29,18 +30,18 @@ from collections.abc import Callable
 
 import numpy as np
 
+from filter_service.filtering.eye_filter import EyeFilter
 from tests.benchmarks import truth_changes, truth_edges
 from tests.benchmarks.engines import ENGINES
 from tests.benchmarks.harness import KeptRows, Row, memory_mb, publish
 from tests.benchmarks.truth_points import (
     EYES,
-    PITCH_MRAD,
     PLACES_DEG,
     STATES,
     WIDE_PX,
     WINDOW_PX,
     PointTruth,
-    camera_around,
+    camera_at,
     lateral_colors,
     opened,
     pixel_at,
@@ -64,15 +65,16 @@ COLOR_EYES = {
 }
 STEP_EYES = ("emmetropia", "keratoconus")
 REFERENCE = "float64 quadrature"
+WIDE_STATE = 1
+"""Index of the state of wide frames."""
 
 
 class Report:
-    """Rows, printed and kept in a file as they are found."""
+    """Rows, kept in a file as they are found."""
 
-    def __init__(self, is_quiet: bool):
+    def __init__(self) -> None:
         self.rows: list[Row] = []
         self.points: list[dict] = []
-        self._is_quiet = is_quiet
         self._kept = KeptRows("truth")
 
     def add(
@@ -93,56 +95,42 @@ class Report:
         )
         self.rows.append(row)
         self._kept.add(row)
-        if not self._is_quiet:
-            print(
-                f"{method:<18} {case:<14} {setting:<26} {median_ms:8.1f} ms  "
-                f"{error_name}: {error:.4g} ({reference})",
-                flush=True,
-            )
 
 
 def add_points(
-    report: Report, truth: PointTruth, engine: str, eye_name: str, n_states: int
+    report: Report, truth: PointTruth, engine: str, eye_name: str, n_places: int
 ) -> None:
-    """Add the images and the energies of points in wide frames and in windows."""
-    camera = camera_around(0.0, 0.0, WIDE_PX)
-    half = len(STATES)
+    """Add the images and the energies of points in windows and in wide frames.
+
+    On the axis, places have the same PSFs: there is one of each state.
+    """
     for method, (settings, goal) in METHODS.items():
-        found: dict[str, list] = {"gray": [], "black": []}
-        with opened(eye_name, camera, engine, **settings) as eye_filter:
-            for number, state in enumerate(STATES[:n_states]):
-                places = [PLACES_DEG[number], PLACES_DEG[number + half]]
-                pixels = [pixel_at(camera, *place) for place in places]
-                for ground, frames in found.items():
-                    frames += zip(
-                        places,
-                        [state] * 2,
-                        point_frames(
-                            *(eye_filter, camera, pixels, state, truth),
-                            is_gray=ground == "gray",
-                        ),
-                        strict=True,
-                    )
-        for ground, frames in found.items():
-            _add_points(report, f"{method}", eye_name, ground, goal, frames)
+        frames = []
+        for number, place in enumerate(PLACES_DEG[:n_places]):
+            state = STATES[number % len(STATES)]
+            if method == "on-axis":
+                if number >= len(STATES):
+                    break
+                place = (0.0, 0.0)
+            camera = camera_at(*place, WINDOW_PX)
+            with opened(eye_name, camera, engine, **settings) as eye_filter:
+                pixels = [(WINDOW_PX[0] // 2, WINDOW_PX[1] // 2)]
+                found = point_frames(
+                    *(eye_filter, camera, pixels, state, truth), is_gray=True
+                )
+            frames.append((place, state, found[0]))
+        _add_points(report, method, eye_name, "gray, window", goal, frames)
     settings, goal = METHODS["quality"]
-    frames = []
-    for number in range(1, n_states, 2):
-        h_deg, v_deg = PLACES_DEG[number]
-        tangent = np.tan(np.radians(h_deg))
-        camera = camera_around(
-            1e3 / PITCH_MRAD * tangent,
-            1e3 / PITCH_MRAD * np.tan(np.radians(v_deg)) * np.hypot(1.0, tangent),
-            WINDOW_PX,
-        )
-        with opened(eye_name, camera, engine, **settings) as eye_filter:
-            own = point_frames(
-                *(eye_filter, camera, [(WINDOW_PX[0] // 2, WINDOW_PX[1] // 2)]),
-                *(STATES[number], truth),
-                is_gray=True,
+    camera = camera_at(0.0, 0.0, WIDE_PX)
+    places, state = PLACES_DEG[WIDE_STATE :: len(STATES)], STATES[WIDE_STATE]
+    pixels = [pixel_at(camera, *place) for place in places]
+    with opened(eye_name, camera, engine, **settings) as eye_filter:
+        for ground in ("gray", "black"):
+            found = point_frames(
+                *(eye_filter, camera, pixels, state, truth), is_gray=ground == "gray"
             )
-        frames.append(((h_deg, v_deg), STATES[number], own[0]))
-    _add_points(report, "quality", eye_name, "gray, window", goal, frames)
+            frames = [*zip(places, [state] * len(places), found, strict=True)]
+            _add_points(report, "quality", eye_name, f"{ground}, wide", goal, frames)
 
 
 def _add_points(report, method, eye_name, ground, goal, frames) -> None:
@@ -150,7 +138,7 @@ def _add_points(report, method, eye_name, ground, goal, frames) -> None:
     energies = np.array([frame.energy_ratio for _, _, frame in frames])
     times_ms = [frame.frame_ms for _, _, frame in frames]
     size = WINDOW_PX if "window" in ground else WIDE_PX
-    setting = f"{ground}, {size[0]}x{size[1]}"
+    setting = f"{ground} {size[0]}x{size[1]}"
     for name, error, against in (
         ("point, largest", errors.max(), f"{REFERENCE}; goal {goal:g}"),
         ("point, mean", errors.mean(), REFERENCE),
@@ -176,18 +164,17 @@ def _add_points(report, method, eye_name, ground, goal, frames) -> None:
     ]
 
 
-def add_steps(report: Report, truth: PointTruth, eyes, methods, n_states: int) -> None:
+def add_steps(report: Report, truth: PointTruth, eyes, methods, n_places: int) -> None:
     """Add the errors of single steps of the way to a frame."""
-    camera = camera_around(0.0, 0.0, WIDE_PX)
-    places = [*PLACES_DEG[:n_states], *PLACES_DEG[len(STATES) :][:n_states]]
+    camera = camera_at(0.0, 0.0, WIDE_PX)
     for eye_name in eyes:
         for method in methods:
             settings, _ = METHODS[method]
             with opened(eye_name, camera, "native", **settings) as eye_filter:
                 steps = Steps(
                     eye_filter,
-                    [pixel_at(camera, *place) for place in places],
-                    [*STATES[:n_states]] * 2,
+                    [pixel_at(camera, *place) for place in PLACES_DEG[:n_places]],
+                    [STATES[k % len(STATES)] for k in range(n_places)],
                 )
                 for step, errors in steps.errors(truth).items():
                     for name in ("largest", "mean"):
@@ -255,30 +242,24 @@ def add_crops(report: Report, engine: str, eyes, modes) -> None:
     """Add windows of frames against full frames."""
     for eye_name in eyes:
         for mode in modes:
-            for tolerance in (0.0, 1.0):
+            found = truth_edges.crop_errors_db(eye_name, engine, mode=mode)
+            for tolerance, error_db in found.items():
                 report.add(
                     *(f"crop, {mode}", eye_name, f"tolerance {tolerance:g}"),
-                    "crop, dB",
-                    truth_edges.crop_error_db(
-                        eye_name, engine, tolerance=tolerance, mode=mode
-                    ),
-                    f"full frame; goal {CROP_GOAL_DB:g}",
+                    *("crop, dB", error_db, f"full frame; goal {CROP_GOAL_DB:g}"),
                 )
 
 
 def add_far(report: Report, truth: PointTruth, engine: str, eyes) -> None:
     """Add the change of distant pixels by a lamp."""
     for eye_name in eyes:
-        for at in truth_edges.LAMP_AT_PX:
-            for tolerance in (0.0, 1.0):
-                report.add(
-                    *(f"lamp {at}", eye_name, f"tolerance {tolerance:g}"),
-                    "far, largest change",
-                    truth_edges.far_change(
-                        eye_name, engine, truth, tolerance=tolerance, at=at
-                    ),
-                    f"the lamp's own light; goal {FAR_GOAL:g}",
-                )
+        found = truth_edges.far_changes(eye_name, engine, truth)
+        for (at, tolerance), change in found.items():
+            report.add(
+                *(f"lamp {at}", eye_name, f"tolerance {tolerance:g}"),
+                *("far, largest change", change),
+                f"the lamp's own light; goal {FAR_GOAL:g}",
+            )
 
 
 def parts(arguments, report: Report) -> dict[str, Callable[[], None]]:
@@ -286,16 +267,16 @@ def parts(arguments, report: Report) -> dict[str, Callable[[], None]]:
     truth, engine, quick = PointTruth(), arguments.engine, arguments.quick
     eyes = EYES[3:4] if quick else EYES
     modes = ("dynamic",) if quick else ("on-axis", "dynamic", "quality")
-    n_states = 2 if quick else len(STATES)
+    n_places = 2 if quick else len(PLACES_DEG)
 
     def points() -> None:
         for eye_name in eyes:
-            add_points(report, truth, engine, eye_name, n_states)
+            add_points(report, truth, engine, eye_name, n_places)
 
     return {
         "points": points,
         "steps": lambda: add_steps(
-            report, truth, eyes if quick else STEP_EYES, tuple(METHODS)[-1:], n_states
+            report, truth, eyes if quick else STEP_EYES, tuple(METHODS)[-1:], n_places
         ),
         "colors": lambda: add_colors(
             *(report, truth, ENGINES[:1] if quick else ENGINES),
@@ -323,10 +304,11 @@ def main() -> None:
     parser.add_argument("--engine", choices=ENGINES, default=ENGINES[0])
     parser.add_argument("--only", action="append", help="a part, such as points")
     arguments = parser.parse_args()
-    report = Report(arguments.json)
-    for name, part in parts(arguments, report).items():
-        if not arguments.only or name in arguments.only:
-            part()
+    report = Report()
+    with EyeFilter(engine=arguments.engine):  # keeps the build worker of all others
+        for name, part in parts(arguments, report).items():
+            if not arguments.only or name in arguments.only:
+                part()
     is_whole = not (arguments.quick or arguments.only or arguments.engine != ENGINES[0])
     publish(
         *("truth", report.rows),

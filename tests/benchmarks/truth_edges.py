@@ -12,7 +12,7 @@ from tests.benchmarks.photograph import motorcycle
 from tests.benchmarks.truth_points import (
     PointState,
     PointTruth,
-    camera_around,
+    camera_at,
     filtered,
     opened,
     placed,
@@ -62,7 +62,7 @@ def lamp_energies(
     edge.  With two layers, the farther surface continues, black, behind the nearer one.
     """
     edge_dpt = EDGES_DPT[eye_name]
-    camera = camera_around(0.0, 0.0, SIZE_PX)
+    camera = camera_at(0.0, 0.0, SIZE_PX)
     width, height = SIZE_PX
     is_left = np.broadcast_to(np.arange(width) < EDGE_X_PX, (height, width))
     settings = {
@@ -128,13 +128,15 @@ CROP_FULL_PX, CROP_PX, CROP_AT_PX = (361, 241), (223, 163), (67, 35)
 CROP_STATE = PointState(4.3, 0.5, 0.5)
 
 
-def crop_error_db(eye_name: str, engine: str, *, tolerance: float, mode: str) -> float:
-    """Return the PSNR of a window's frame against the same part of the full frame.
+def crop_errors_db(
+    eye_name: str, engine: str, *, mode: str, tolerances: tuple[float, ...] = (0.0, 1.0)
+) -> dict[float, float]:
+    """Return the PSNR of a window against the same part of the full frame.
 
     Pixels nearer to the border of the window than light reaches are left out.  Linear
-    light, with 1 as its peak.
+    light, with 1 as its peak; by tolerance.
     """
-    full = camera_around(0.0, 0.0, CROP_FULL_PX)
+    full = camera_at(0.0, 0.0, CROP_FULL_PX)
     view = picture(full)
     (x, y), (width, height) = CROP_AT_PX, CROP_PX
     left, right, up, down = full.tangents
@@ -148,15 +150,16 @@ def crop_error_db(eye_name: str, engine: str, *, tolerance: float, mode: str) ->
         ),
     )
     part = slice(y, y + height), slice(x, x + width)
-    seen = []
+    seen: dict[float, list[np.ndarray]] = {tolerance: [] for tolerance in tolerances}
     for camera, place in ((full, (slice(None), slice(None))), (window, part)):
         with opened(eye_name, camera, engine, mode=mode) as eye_filter:
-            found = filtered(
-                *(eye_filter, np.ascontiguousarray(view.color[place])),
-                *(np.ascontiguousarray(view.depth_m[place]), camera, CROP_STATE),
-                render_tolerance=tolerance,
-            )
-            # The lens is relaxed or focused; the farthest and the nearest point.
+            for tolerance, colors in seen.items():
+                found = filtered(
+                    *(eye_filter, np.ascontiguousarray(view.color[place])),
+                    *(np.ascontiguousarray(view.depth_m[place]), camera, CROP_STATE),
+                    render_tolerance=tolerance,
+                )
+                colors.append(found.color.astype(np.float64))
             reach_px = max(
                 point.spot_px() + EDGE_REACH_PX
                 for object_dpt in (1.0 / view.depth_m.max(), 1.0 / view.depth_m.min())
@@ -165,13 +168,15 @@ def crop_error_db(eye_name: str, engine: str, *, tolerance: float, mode: str) ->
                     replace(CROP_STATE, object_dpt=float(object_dpt)),
                 )
             )
-        seen.append(found.color.astype(np.float64))
     border = math.ceil(reach_px)
-    inner = slice(border, height - border), slice(border, width - border)
-    difference = (seen[0][part] - seen[1])[inner]
-    if not difference.size:
+    if 2 * border >= min(width, height):
         raise ValueError(f"light reaches {border} px: the window has none left")
-    return float(-10.0 * np.log10(max(np.mean(difference**2), 1e-30)))
+    inner = slice(border, height - border), slice(border, width - border)
+    return {
+        tolerance: -10.0
+        * math.log10(max(float(np.mean((whole[part] - own)[inner] ** 2)), 1e-30))
+        for tolerance, (whole, own) in seen.items()
+    }
 
 
 EDGE_REACH_PX = 12.0
@@ -197,31 +202,38 @@ LAMP_AT_PX = {"sampled": (32, 120), "not sampled": (35, 117)}
 FAR_PX = 180
 
 
-def far_change(
-    eye_name: str, engine: str, truth: PointTruth, *, tolerance: float, at: str
-) -> float:
+def far_changes(
+    eye_name: str,
+    engine: str,
+    truth: PointTruth,
+    *,
+    tolerances: tuple[float, ...] = (0.0, 1.0),
+) -> dict[tuple[str, float], float]:
     """Return the largest change of pixels from `FAR_PX` on by a lamp at the left.
 
-    The lamp's own light by the reference is subtracted.
+    The lamp's own light by the reference is subtracted; by place and tolerance.
     """
-    camera = camera_around(0.0, 0.0, CROP_FULL_PX)
+    camera = camera_at(0.0, 0.0, CROP_FULL_PX)
     view = picture(camera)
-    (x, y), seen = LAMP_AT_PX[at], []
+    found = {}
     with opened(eye_name, camera, engine, mode="dynamic") as eye_filter:
-        for light in (view.color[y, x].copy(), LAMP_LIGHT):
-            color = view.color.copy()
-            color[y, x] = light
-            found = filtered(
-                *(eye_filter, color, view.depth_m, camera, CROP_STATE),
-                render_tolerance=tolerance,
+        for at, (x, y) in LAMP_AT_PX.items():
+            with_lamp = view.color.copy()
+            with_lamp[y, x] = LAMP_LIGHT
+            state = replace(CROP_STATE, object_dpt=1.0 / float(view.depth_m[y, x]))
+            images = truth.images(
+                wavefronts_of(eye_filter, camera, x, y, state), max(CROP_FULL_PX)
             )
-            seen.append(found.color.astype(np.float64))
-        state = replace(CROP_STATE, object_dpt=1.0 / float(view.depth_m[y, x]))
-        points = wavefronts_of(eye_filter, camera, x, y, state)
-    own = [
-        placed(image, x, y, CROP_FULL_PX)
-        for image in truth.images(points, max(CROP_FULL_PX))
-    ]
-    change = seen[1] - seen[0]
-    change -= np.stack(own, axis=-1) * (LAMP_LIGHT - view.color[y, x])
-    return float(np.abs(change[:, FAR_PX:]).max())
+            own = np.stack([placed(i, x, y, CROP_FULL_PX) for i in images], axis=-1)
+            own *= LAMP_LIGHT - view.color[y, x]
+            for tolerance in tolerances:
+                plain, lit = (
+                    filtered(
+                        *(eye_filter, color, view.depth_m, camera, CROP_STATE),
+                        render_tolerance=tolerance,
+                    ).color.astype(np.float64)
+                    for color in (view.color, with_lamp)
+                )
+                change = (lit - plain - own)[:, FAR_PX:]
+                found[at, tolerance] = float(np.abs(change).max())
+    return found

@@ -1,6 +1,7 @@
 """Points of light in frames, for `bench_truth`."""
 
 import hashlib
+import math
 import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -11,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.field.eye_optics import EyeOptics
+from estimator.optics import pinhole
 from filter_service.camera import Camera
 from filter_service.filtering.eye_filter import EyeFilter
 from filter_service.rgbd_view import RgbdView
@@ -34,23 +36,17 @@ GRAY = 0.25
 """Light of the other pixels of a gray frame."""
 
 
-def camera_around(x_px: float, y_px: float, size_px: tuple[int, int]) -> Camera:
-    """Return a camera of `PITCH_MRAD` whose image is centered on a place.
+def tangents_at(h_deg: float, v_deg: float) -> tuple[float, float]:
+    """Return the tangents to the right and upward of azimuth and elevation."""
+    tangent_x = math.tan(math.radians(h_deg))
+    return tangent_x, math.tan(math.radians(v_deg)) * math.hypot(1.0, tangent_x)
 
-    Parameters
-    ----------
-    x_px, y_px : float
-        Pixels to the right of the axis and above it.
-    """
-    step = PITCH_MRAD / 1000.0
-    half_x, half_y = size_px[0] / 2.0, size_px[1] / 2.0
-    return Camera(
-        *size_px,
-        (
-            *(step * (x_px - half_x), step * (x_px + half_x)),
-            *(step * (y_px + half_y), step * (y_px - half_y)),
-        ),
-    )
+
+def camera_at(h_deg: float, v_deg: float, size_px: tuple[int, int]) -> Camera:
+    """Return a camera of `PITCH_MRAD` with a direction in the middle of its image."""
+    x, y = tangents_at(h_deg, v_deg)
+    half_x, half_y = (PITCH_MRAD / 2000.0 * n for n in size_px)
+    return Camera(*size_px, (x - half_x, x + half_x, y + half_y, y - half_y))
 
 
 @dataclass(frozen=True)
@@ -72,23 +68,20 @@ STATES = (
     PointState(3.0, 0.5, 0.5),
     PointState(4.3, 1.0, 2.7),
     PointState(5.2, 3.0, 0.3),
-    PointState(6.0, 0.2, 0.2),
-    PointState(3.6, 5.5, 5.5),
-    PointState(4.7, 2.0, 1.2),
+    PointState(6.0, 4.0, 4.0),
 )
 PLACES_DEG = (
     *((0.0, 0.0), (17.3, 11.1), (-13.2, 0.4), (21.0, -9.3), (3.1, -14.2), (-24.4, 8.8)),
     *((28.5, 17.5), (-6.6, 5.2), (9.7, 18.0), (-27.7, -16.9), (14.8, -3.3)),
     (-19.9, -12.7),
 )
-"""Azimuth and elevation; two places share a state, far apart."""
+"""Azimuth and elevation; every fourth place has the same state."""
 
 
 def pixel_at(camera: Camera, h_deg: float, v_deg: float) -> tuple[int, int]:
     """Return the column and row of a direction (azimuth, elevation)."""
     left, right, up, down = camera.tangents
-    tangent_x = np.tan(np.radians(h_deg))
-    tangent_y = np.tan(np.radians(v_deg)) * np.hypot(1.0, tangent_x)
+    tangent_x, tangent_y = tangents_at(h_deg, v_deg)
     x = (tangent_x - left) / (right - left) * camera.width_px
     y = (up - tangent_y) / (up - down) * camera.height_px
     return int(np.floor(x)), int(np.floor(y))
@@ -320,14 +313,17 @@ def lateral_colors(profile, engine: str, truth: PointTruth, mode: str):
         Largest angle of a pixel.
     frame_ms : float
     """
-    camera = camera_around(0.0, 0.0, WIDE_PX)
+    camera = camera_at(0.0, 0.0, WIDE_PX)
     pixels = []
     for eccentricity_deg, meridian_deg in COLOR_PLACES_DEG:
-        tangent, angle = np.tan(np.radians(eccentricity_deg)), np.radians(meridian_deg)
-        left, right, up, down = camera.tangents
-        x = (tangent * np.cos(angle) - left) / (right - left) * camera.width_px
-        y = (up - tangent * np.sin(angle)) / (up - down) * camera.height_px
-        pixels.append((int(x), int(y)))
+        away, angle = (
+            math.tan(math.radians(eccentricity_deg)),
+            math.radians(meridian_deg),
+        )
+        h_deg, v_deg = pinhole.direction_deg(
+            away * math.cos(angle), away * math.sin(angle)
+        )
+        pixels.append(pixel_at(camera, float(h_deg), float(v_deg)))
     with opened(profile, camera, engine, mode=mode, lateral_color=True) as eye_filter:
         frames = point_frames(
             *(eye_filter, camera, pixels, COLOR_STATE, truth),
