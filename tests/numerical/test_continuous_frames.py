@@ -1,5 +1,7 @@
 """Frames that change continuously with depth, and lamps beside edges."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -110,6 +112,24 @@ def test_a_lamp_beside_an_edge_has_the_energy_of_its_visible_part(
         visible = alone if is_near else alone[:, WIDTH // 2 :]
         assert is_near or visible.sum() < 0.99 * alone.sum()
         assert beside.sum() == pytest.approx(visible.sum(), rel=0.02)
+
+
+def test_a_lamp_behind_a_blurred_edge_is_as_bright_with_one_layer_as_with_two(bench):
+    near = X < WIDTH // 2
+    depth_m = np.where(near, 1.0 / 2.5, 1.0 / 0.5).astype(np.float32)
+    for distance_px in (1, 3):
+        color = np.zeros((HEIGHT, WIDTH, 3), np.float32)
+        color[HEIGHT // 2, WIDTH // 2 - 1 + distance_px] = 1.0
+        view = bench.view(color, depth_m, "radial")
+        hidden_m = np.where(near, np.float32(2.0), np.float32(0.0))
+        layered = replace(
+            view, hidden_color=np.zeros_like(color), hidden_depth_m=hidden_m
+        )
+        one, two = (
+            bench.render(v, **STATE | {"focus_dpt": 2.0}).color.sum(dtype=float)
+            for v in (view, layered)
+        )
+        assert one == pytest.approx(two, rel=0.02)
 
 
 def test_squares_merge_gradually(bench, rng):

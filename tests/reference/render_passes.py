@@ -333,12 +333,16 @@ def _sources(linear, distances_dpt, layers, key) -> _Sources:
 
 def _shown(light, coverage, excess, own):
     """Return light over coverage; missing coverage does not amplify the excess."""
-    mean = light.mean(axis=-1, keepdims=True)
-    share = np.where(mean > 0.0, excess / np.where(mean > 0.0, mean, 1.0), 0.0)
-    lacking = np.maximum(1.0 - coverage, 0.0)
     shown = light / np.maximum(coverage, MIN_COVERAGE)
-    shown = shown * (1.0 - np.minimum(share, 1.0) * lacking)
+    shown = shown * (1.0 - _excess_share(light, excess) * (1.0 - coverage))
     return np.where(coverage >= MIN_COVERAGE, shown, own)
+
+
+def _excess_share(light, excess):
+    """Return the share (..., 1) of light (..., 3) that is in excess."""
+    mean = light.mean(axis=-1, keepdims=True)
+    is_lit = mean > 0.0
+    return np.where(is_lit, np.minimum(excess / np.where(is_lit, mean, 1.0), 1.0), 0.0)
 
 
 def _gather(linear, kernel, fraction, key, kernels, accumulate, rows):
@@ -415,10 +419,12 @@ def _by_groups(place, sums):
     while at.size:
         end = (group[at] <= group[at, first[at]][:, None]).sum(axis=1)
         own = before[at, end] - before[at, first[at]]
-        room = 1.0 - total[at, 3:6]
-        share = np.minimum(room / np.maximum(own[:, 3:6], MIN_COVERAGE), 1.0)
-        # the excess takes the share of green
-        total[at] += np.concatenate([share, share, share[:, 1:2]], axis=1) * own
+        room, coverage = 1.0 - total[at, 3:6], own[:, 3:6]
+        share = np.minimum(room / np.maximum(coverage, MIN_COVERAGE), 1.0)
+        # what the coverage lacks is not as bright as the excess
+        whole = np.minimum(room / np.maximum(coverage, 1.0), share)
+        of_light = share + _excess_share(own[:, :3], own[:, 6:]) * (whole - share)
+        total[at] += np.concatenate([of_light, share, whole[:, 1:2]], axis=1) * own
         first[at] = end
         at = at[end < n_columns]
     return total.reshape(*shape, 7)

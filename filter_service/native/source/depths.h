@@ -93,6 +93,18 @@ INLINE float least_color(f32x8 lanes) {
  * for the total, or not at all. */
 enum { SEEN, COVERED, UNSEEN };
 
+/* Composites two pixels of a group with light in excess.  What lies behind nearer depths has
+ * the free coverage as its share of this light, as if the group's coverage were complete:
+ * what it lacks is not as bright. */
+INLINE void close_excess(const pixel_pair *open, pixel_pair *near, f32x8 room, f32x8 share) {
+    f32x8 whole = smaller8(room / larger8(open->coverage, all8(1.0f)), share);
+    near->light += (share + excess_shares(open) * (whole - share)) * open->light;
+    i32x8 is_excess = {0, 0, 0, -1, 0, 0, 0, -1};
+    f32x8 green = second_as_fourth8(whole);
+    share = (f32x8)(((i32x8)share & ~is_excess) | ((i32x8)green & is_excess));
+    near->coverage += share * open->coverage;
+}
+
 /* Composites a group; its fragments share the coverage that nearer ones leave. */
 static int close_group(window *w, depth_group *group) {
     if (!gather_sizes(group)) return SEEN;
@@ -104,10 +116,14 @@ static int close_group(window *w, depth_group *group) {
         for (int x = 0; x < w->width / 2; ++x) {
             f32x8 light = open[x].light, coverage = open[x].coverage;
             f32x8 most = larger8(coverage, all8(MIN_COVERAGE));
-            f32x8 share = smaller8((all8(1.0f) - near[x].coverage) / most, all8(1.0f));
-            share = second_as_fourth8(share); /* of green, for the excess */
-            near[x].light += share * light;
-            near[x].coverage += share * coverage;
+            f32x8 room = all8(1.0f) - near[x].coverage;
+            f32x8 share = smaller8(room / most, all8(1.0f));
+            if (has_excess(open + x)) {
+                close_excess(open + x, near + x, room, share);
+            } else {
+                near[x].light += share * light;
+                near[x].coverage += share * coverage;
+            }
             total[x].light += light;
             total[x].coverage += coverage;
             least = smaller8(near[x].coverage, least);

@@ -7,16 +7,7 @@
 /* Light of each pixel relative to its light over coverage: coverage changes the excess
  * neither where it is missing, nor where kernels of different shape add up to more than 1. */
 INLINE f32x8 kept_light(const pixel_pair *sums) {
-    f32x8 lacking = all8(1.0f) - sums->coverage;
-    f32x8 kept = all8(1.0f);
-    for (int pixel = 0; pixel < 8; pixel += 4) {
-        f32x8 light = sums->light;
-        float mean = (light[pixel] + light[pixel + 1] + light[pixel + 2]) * (1.0f / RGB);
-        float excess = sums->coverage[pixel + 3];
-        float share = mean > 0.0f ? smaller_float(excess / mean, 1.0f) : 0.0f;
-        for (int i = pixel; i < pixel + 4; ++i) kept[i] -= share * lacking[i];
-    }
-    return kept;
+    return all8(1.0f) - excess_shares(sums) * (all8(1.0f) - sums->coverage);
 }
 
 /* Light of two pixels over their coverage; without coverage, the pixels' own light.  Pixels
@@ -25,7 +16,7 @@ INLINE f32x8 seen_light(const frame *f, const pixel_pair *sums, int x, int y, in
                         int right) {
     f32x8 least = all8(MIN_COVERAGE);
     f32x8 light = sums->light / larger8(sums->coverage, least);
-    if (sums->coverage[3] + sums->coverage[7] > 0.0f && !f->paper_rule)
+    if (has_excess(sums) && !f->paper_rule)
         light *= kept_light(sums);
     i32x8 lacks = (sums->coverage < least) & (i32x8){-1, -1, -1, 0, -1, -1, -1, 0};
     if (!any8(lacks)) return light;

@@ -7,6 +7,23 @@
  * strength of edges with the light, and the excess light with the coverage. */
 typedef struct { f32x8 light, coverage; } pixel_pair;
 
+/* Share of each pixel's light that is in excess of its surroundings. */
+INLINE f32x8 excess_shares(const pixel_pair *sums) {
+    float shares[2];
+    for (int pixel = 0; pixel < 2; ++pixel) {
+        const float *light = (const float *)&sums->light + 4 * pixel;
+        float mean = (light[0] + light[1] + light[2]) * (1.0f / RGB);
+        float excess = ((const float *)&sums->coverage)[4 * pixel + 3];
+        shares[pixel] = mean > 0.0f ? smaller_float(excess / mean, 1.0f) : 0.0f;
+    }
+    return (f32x8){shares[0], shares[0], shares[0], shares[0],
+                   shares[1], shares[1], shares[1], shares[1]};
+}
+
+INLINE int has_excess(const pixel_pair *sums) {
+    return sums->coverage[3] + sums->coverage[7] > 0.0f;
+}
+
 #define PAIRS_ACROSS (BIN_WIDTH / 2)
 
 /* Accumulated pixels of one size.  Those of 2 and 4 px extend one pixel beyond the window on
