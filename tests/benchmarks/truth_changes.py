@@ -58,16 +58,16 @@ class Halvings:
     largest: NDArray[np.float64]
     rms: NDArray[np.float64]
 
-    @staticmethod
-    def least_ratio(changes: NDArray[np.float64]) -> float:
-        """Return the least ratio of consecutive changes, down to `LEAST_CHANGE`.
 
-        It is 2 if the frame changes in proportion to the step, and NaN if there is no
-        pair of changes.
-        """
-        pairs = changes[1:] >= LEAST_CHANGE
-        ratios = changes[:-1][pairs] / changes[1:][pairs]
-        return float(ratios.min()) if ratios.size else float("nan")
+def least_ratio(changes: NDArray[np.float64]) -> float | None:
+    """Return the least ratio of consecutive changes, down to `LEAST_CHANGE`.
+
+    It is 2 if the frame changes in proportion to the step, and None if no second change
+    is as large.
+    """
+    pairs = changes[1:] >= LEAST_CHANGE
+    ratios = changes[:-1][pairs] / changes[1:][pairs]
+    return float(ratios.min()) if ratios.size else None
 
 
 def _with_noise(view: RgbdView, ratio: float) -> RgbdView:

@@ -4,12 +4,14 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from filter_service.camera import Camera
 from filter_service.rendering.media_effects import linear_from_srgb
 from filter_service.rgbd_view import RgbdView
 from tests.benchmarks.photograph import motorcycle
 from tests.benchmarks.truth_points import (
+    PITCH_MRAD,
     PointState,
     PointTruth,
     camera_at,
@@ -25,6 +27,9 @@ PUPIL_MM = 6.0
 AWAY_DPT = 2.0
 """Distance of the lamp from the edge: blur of 6 px."""
 
+PUPIL_POINTS = 401
+"""Points across the pupil from which rays start."""
+
 EDGES_DPT = {"emmetropia": 3.0, "myopia": 8.0, "post_lasik": 3.0}
 """Eyes, and a distance that they can focus on."""
 
@@ -35,16 +40,17 @@ class LampEnergy:
 
     Attributes
     ----------
-    seen, exact : (n, 3)
+    seen : (n, 3)
+    image : (n, 3)
+        Share of the lamp's image that does not fall on nearer pixels.
+    rays : (n, 3)
+        Share of the pupil whose rays to the lamp pass the edge.  They do so wherever
+        aberrations send their light; where the edge is sharp, the shares are equal.
     """
 
-    seen: np.ndarray
-    exact: np.ndarray
-
-    @property
-    def error(self) -> float:
-        """Largest difference."""
-        return float(np.abs(self.seen - self.exact).max())
+    seen: NDArray[np.float64]
+    image: NDArray[np.float64]
+    rays: NDArray[np.float64]
 
 
 def lamp_energies(
@@ -84,6 +90,12 @@ def lamp_energies(
                 np.zeros((height, width, 3), np.float32),
                 np.where(is_near, far_m, 0.0).astype(np.float32),
             )
+            shares = None  # the whole image
+            if place == "behind":
+                shares = _visible_shares(
+                    *(eye_filter, camera, state, truth, distances_px),
+                    *(is_near, edge_dpt),
+                )
             for layers, layer in (("one layer", (None, None)), ("two layers", hidden)):
                 for tolerance in tolerances:
                     rows = []
@@ -97,29 +109,42 @@ def lamp_energies(
                             render_tolerance=tolerance,
                         )
                         rows.append(seen.color.sum(axis=(0, 1), dtype=np.float64))
-                    exact = _visible_shares(
-                        *(eye_filter, camera, state, truth, distances_px),
-                        is_near if place == "behind" else np.zeros_like(is_near),
+                    found[place, layers, tolerance] = LampEnergy(
+                        np.array(rows), *(shares or (np.ones((len(rows), 3)),) * 2)
                     )
-                    found[place, layers, tolerance] = LampEnergy(np.array(rows), exact)
     return found
 
 
-def _visible_shares(eye_filter, camera, state, truth, distances_px, is_hidden):
-    """Return the shares (n, 3) of light that does not fall on hidden pixels.
+def _visible_shares(
+    eye_filter, camera, state, truth, distances_px, is_hidden, edge_dpt
+):
+    """Return the shares (n, 3) of images and of rays that are not hidden.
 
     Lamps are at most 0.2 degrees from the middle one, whose image they have.
     """
     lamps_px = [EDGE_X_PX + distance_px - 1 for distance_px in distances_px]
     middle_px = lamps_px[len(lamps_px) // 2]
     points = wavefronts_of(eye_filter, camera, middle_px, LAMP_Y_PX, state)
-    images = truth.images(points, max(SIZE_PX))
-    return np.array(
-        [
-            [1.0 - placed(i, x, LAMP_Y_PX, SIZE_PX)[is_hidden].sum() for i in images]
-            for x in lamps_px
-        ]
+    hidden = [
+        [placed(image, x, LAMP_Y_PX, SIZE_PX)[is_hidden].sum() for x in lamps_px]
+        for image in truth.images(points, max(SIZE_PX))
+    ]
+    # From a point u of the pupil, the lamp is at the angle of the edge's distance that
+    # it has from the center, plus u times the difference of vergence.
+    across = np.linspace(-1.0, 1.0, PUPIL_POINTS)
+    x, y = (
+        v[np.hypot(*np.meshgrid(across, across)) <= 1.0]
+        for v in np.meshgrid(across, across)
     )
+    passing = []
+    for point in points:
+        center_x, _, major, minor, angle = point.pupil_ellipse
+        u_mm = center_x + major * x * math.cos(angle) - minor * y * math.sin(angle)
+        moved_px = u_mm * (edge_dpt - state.object_dpt) / PITCH_MRAD
+        passing.append(
+            [float(np.mean(x_px + 0.5 + moved_px > EDGE_X_PX)) for x_px in lamps_px]
+        )
+    return 1.0 - np.transpose(hidden), np.transpose(passing)
 
 
 CROP_FULL_PX, CROP_PX, CROP_AT_PX = (361, 241), (223, 163), (67, 35)

@@ -6,7 +6,7 @@ import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from estimator.field.eye_optics import EyeOptics
 from estimator.optics import pinhole
 from filter_service.camera import Camera
-from filter_service.filtering.eye_filter import EyeFilter
+from filter_service.filtering.eye_filter import EyeFilter, as_profile
 from filter_service.rgbd_view import RgbdView
 from filter_service.settings import FilterSettings
 from tests.benchmarks.harness import OUT
@@ -218,10 +218,11 @@ class PointFrame:
 
 
 @contextmanager
-def opened(eye_name, camera: Camera, engine: str, **settings) -> Iterator[EyeFilter]:
-    """Open a filter of a profile."""
+def opened(profile, camera: Camera, engine: str, **settings) -> Iterator[EyeFilter]:
+    """Open a filter of a profile without scattered light, which is not in PSFs."""
+    profile = replace(as_profile(profile), straylight=None)
     with EyeFilter(
-        eye_name, camera, FilterSettings(**settings), engine=engine
+        profile, camera, FilterSettings(**settings), engine=engine
     ) as eye_filter:
         eye_filter.wait()
         yield eye_filter
