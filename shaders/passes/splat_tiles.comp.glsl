@@ -406,13 +406,13 @@ void add_in_order(int count, ivec2 in_tile, inout float open_group) {
 }
 #endif
 
-// The color of a pixel from its sums.  Missing coverage amplifies the light that arrives,
-// except light in excess of its surroundings.
+// The color of a pixel from its sums.  Coverage changes the excess light neither where it is
+// missing, nor where kernels of different shape add up to more than 1.
 vec3 color_of(Sum sum, vec3 own) {
     float light = dot(sum.light, vec3(1.0 / float(RGB)));
     float part = light > 0.0 ? clamp(sum.excess / light, 0.0, 1.0) : 0.0;
     vec3 normalized = sum.light / max(sum.coverage, vec3(MIN_COVERAGE))
-                    * (1.0 - part * max(1.0 - sum.coverage, 0.0));
+                    * (1.0 - part * (1.0 - sum.coverage));
     return mix(own, normalized, vec3(greaterThanEqual(sum.coverage, vec3(MIN_COVERAGE))));
 }
 
