@@ -221,8 +221,10 @@ could hold a cache over the whole field."""
 
 KERNEL_WORDS = 3
 NODE_WORDS = 2
-PART_WORDS = 5
-"""uvec4 words of one record: a frame's kernel, a node kernel, a part of a kernel."""
+PART_MAPS = 3
+PART_WORDS = PART_MAPS + 6
+"""uvec4 words of one record: a frame's kernel, a node kernel, the parts of a kernel
+(nodes, weights at both ends of the interval, and from PART_MAPS on maps)."""
 
 FIELD_CORNERS = 3
 """Field nodes around a cell, and nodes of pupil and accommodation around a state: the
@@ -268,6 +270,10 @@ PSFs; kernels and node kernels of earlier frames; lengths of the work lists."""
 
 PSF_WORDS = 5
 """Words of a cached kernel's record: offset, reach, radius px, spread px, peak."""
+
+MIN_NODE_SHARE = 5e-5
+"""Share of a node of defocus below which the passes do not read it: a state at a node
+does not read its neighbor for the rounding of 32-bit floats."""
 
 MAP_WORDS = 4
 CELL_WORDS = FIELD_CORNERS * (2 + MAP_WORDS)

@@ -1,9 +1,9 @@
 // Blends the kernels of up to three field nodes into the kernel of an image cell.
 // Each is mapped from the pixels it is stored in to the image's: a pixel receives the
 // light of the stored pixels that it covers.
-// In:  the node atlas, NODES (as in blend_psfs), PARTS (three node kernels, three weights,
-//      three maps from offsets in the image to those in a node's kernel), KERNELS
-//      (common/kernels.glsl), WORK, PLAN.
+// In:  the node atlas, NODES (as in blend_psfs), PARTS (three node kernels; and at both ends
+//      of the interval three weights, and three maps from offsets in the image to those in a
+//      node's kernel), KERNELS (common/kernels.glsl), WORK, PLAN.
 // Out: the kernel atlas, single kernels.
 // Dispatch: groups of THREADS texels take the items of WORK in turn.
 // Twin: reference.kernel_pairs.  Source: Csoba & Kunkli 2023, section 6.3.
@@ -28,38 +28,43 @@ layout(rgba32ui, binding = IMAGE_ATLAS) writeonly uniform uimage2D atlas;
 #include "common/work.glsl"
 #include "common/reach.glsl"
 
-void add_texel(int first, Reach reach, ivec2 at, float weight, inout vec3 near,
-               inout vec3 far) {
-    if (!within(reach, at)) return;
-    uvec4 ends = ATLAS_FETCH(node_atlas, first + reach_texel(reach, at));
-    near += weight * near_weights(ends);
-    far += weight * far_weights(ends);
+// Pixels of a node's kernel that a pixel of the image covers.
+struct Cover { vec2 low; vec2 high; };
+
+Cover cover_of(vec4 map, ivec2 at) {
+    vec2 middle = vec2(dot(map.xy, vec2(at)), dot(map.zw, vec2(at)));
+    return Cover(middle - 0.5 * abs(map.xw), middle + 0.5 * abs(map.xw));
 }
 
-// Adds one part of a kernel at an offset from its center.
+float covered(Cover cover, vec2 stored) {
+    vec2 sides = min(cover.high, stored + 0.5) - max(cover.low, stored - 0.5);
+    sides = max(sides, 0.0);
+    return sides.x * sides.y;
+}
+
+// Adds one part of a kernel at an offset from its center.  Both ends of the interval have
+// maps of their own.
 void add_node(uint part, uint index, ivec2 at, inout vec3 near, inout vec3 far) {
-    float weight = uintBitsToFloat(parts[part + 1u][index]);
-    if (weight == 0.0) return;
+    vec2 weight = vec2(uintBitsToFloat(parts[part + 1u][index]),
+                       uintBitsToFloat(parts[part + 2u][index]));
+    if (weight == vec2(0.0)) return;
     uint node = parts[part][index];
     uvec4 place = nodes[node * uint(NODE_WORDS)];
     Reach reach = unpack_reach(place.w);
     weight *= uintBitsToFloat(nodes[node * uint(NODE_WORDS) + 1u].x) / WEIGHT_MAX;
-    vec4 map = uintBitsToFloat(parts[part + 2u + index]);
-    if (map == vec4(1.0, 0.0, 0.0, 1.0)) {
-        add_texel(int(place.z), reach, at, weight, near, far);
-        return;
-    }
-    vec2 middle = vec2(dot(map.xy, vec2(at)), dot(map.zw, vec2(at)));
-    vec2 low = middle - 0.5 * abs(map.xw);
-    vec2 high = middle + 0.5 * abs(map.xw);
+    uint maps = part + uint(PART_MAPS) + index;
+    Cover near_cover = cover_of(uintBitsToFloat(parts[maps]), at);
+    Cover far_cover = cover_of(uintBitsToFloat(parts[maps + uint(FIELD_CORNERS)]), at);
+    vec2 low = min(near_cover.low, far_cover.low);
+    vec2 high = max(near_cover.high, far_cover.high);
     ivec2 first = max(ivec2(floor(low + 0.5)), -ivec2(reach.left, reach.up));
     ivec2 last = min(ivec2(ceil(high - 0.5)), ivec2(reach.right, reach.down));
     for (int y = first.y; y <= last.y; ++y) {
         for (int x = first.x; x <= last.x; ++x) {
-            vec2 stored = vec2(x, y);
-            vec2 covered = max(min(high, stored + 0.5) - max(low, stored - 0.5), 0.0);
-            add_texel(int(place.z), reach, ivec2(x, y), weight * covered.x * covered.y,
-                      near, far);
+            int texel = int(place.z) + reach_texel(reach, ivec2(x, y));
+            uvec4 ends = ATLAS_FETCH(node_atlas, texel);
+            near += weight.x * covered(near_cover, vec2(x, y)) * near_weights(ends);
+            far += weight.y * covered(far_cover, vec2(x, y)) * far_weights(ends);
         }
     }
 }

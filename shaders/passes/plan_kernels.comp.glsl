@@ -34,10 +34,20 @@ shared uint item_count[LEVELS];
 // Sum of the parts of a kernel, and the largest of their sides.
 struct Sizes { ivec4 reach; int radius; float peak; vec2 spread; };
 
-// Whether a map changes a kernel noticeably.
-bool needs_map(vec4 map, int radius) {
-    float change = length(map - vec4(1.0, 0.0, 0.0, 1.0));
-    return change > MIN_SHIFT_RATIO && change * float(radius) > MIN_SHIFT_PX;
+// A map from the image's pixels to a node's, and what it does to a kernel.
+struct Map { vec4 to_node; float area; float box; };
+
+const vec4 UNMOVED = vec4(1.0, 0.0, 0.0, 1.0);
+
+// A map as far as a kernel of this spread needs it: not if it changes little.
+Map needed_map(vec4 map, float spread_px) {
+    float change = length(map - UNMOVED);
+    float shift_px = change * (spread_px + KERNEL_TAIL_PX);
+    float share = clamp((change - MIN_SHIFT_RATIO) / MIN_SHIFT_FADE_RATIO, 0.0, 1.0)
+                * clamp((shift_px - MIN_SHIFT_PX) / MIN_SHIFT_FADE_PX, 0.0, 1.0);
+    map = mix(UNMOVED, map, share);
+    float area = abs(map.x * map.w - map.y * map.z);
+    return Map(map, area, area / abs(map.x * map.w));
 }
 
 // Reaches along an axis of the image, from those in the node's pixels: row of the inverse
@@ -50,46 +60,53 @@ ivec2 mapped_sides(vec2 row, vec4 stored) {
     return clamp(ivec2(sides), 0, MAX_REACH_PX);
 }
 
-// Writes a part's node, weight and map, and adds it to the sums.
+// Widens a kernel by a part at one end of its interval.
+void add_end(Map map, ivec4 sides, int radius, inout Sizes sum) {
+    if (map.to_node != UNMOVED) {
+        vec4 to_node = map.to_node;
+        float determinant = to_node.x * to_node.w - to_node.y * to_node.z;
+        float longest = 0.5 * (length(vec2(to_node.x + to_node.w, to_node.y - to_node.z))
+                               + length(vec2(to_node.x - to_node.w, to_node.y + to_node.z)));
+        vec4 stored = vec4(sides) + 1.0;
+        sides = ivec4(mapped_sides(vec2(to_node.w, -to_node.y) / determinant, stored),
+                      mapped_sides(vec2(-to_node.z, to_node.x) / determinant, stored));
+        radius = int(min(ceil(longest / map.area * float(radius + 1)), float(MAX_REACH_PX)));
+    }
+    sum.reach = max(sum.reach, sides);
+    sum.radius = max(sum.radius, radius);
+}
+
+// Writes a part's node, and its weights and maps at both ends, and adds it to the sums.
 void add_part(uint kernel, uint corner, uint cell, uint interval, inout uvec4 part,
-              inout uvec4 weights, inout Sizes sum) {
+              inout vec4 near_weights, inout vec4 far_weights, inout Sizes sum) {
     uint record = cell * uint(CELL_WORDS);
     float weight = uintBitsToFloat(cells[record + uint(FIELD_CORNERS) + corner]);
     uint map_at = record + 2u * uint(FIELD_CORNERS) + corner * uint(MAP_WORDS);
     vec4 map = uintBitsToFloat(uvec4(cells[map_at], cells[map_at + 1u], cells[map_at + 2u],
                                      cells[map_at + 1u + 2u]));
     uint node = 0u;
-    vec4 used_map = vec4(1.0, 0.0, 0.0, 1.0);
+    Map near = Map(UNMOVED, 1.0, 1.0);
+    Map far = near;
     if (weight > 0.0) {
         uint field = cells[record + corner];
         node = node_of[field * uint(interval_count(layer_count)) + interval];
         Reach reach = unpack_reach(nodes[node * uint(NODE_WORDS)].w);
         uvec4 sizes = nodes[node * uint(NODE_WORDS) + 1u];
         ivec4 sides = ivec4(reach.left, reach.right, reach.up, reach.down);
-        int radius = int(sizes.w);
-        float area = 1.0;
-        float box = 1.0;
-        if (needs_map(map, radius)) {
-            used_map = map;
-            float determinant = map.x * map.w - map.y * map.z;
-            area = abs(determinant);
-            box = area / abs(map.x * map.w);
-            float longest = 0.5 * (length(vec2(map.x + map.w, map.y - map.z))
-                                   + length(vec2(map.x - map.w, map.y + map.z)));
-            vec4 stored = vec4(sides) + 1.0;
-            sides = ivec4(mapped_sides(vec2(map.w, -map.y) / determinant, stored),
-                          mapped_sides(vec2(-map.z, map.x) / determinant, stored));
-            radius = int(min(ceil(longest / area * float(radius + 1)), float(MAX_REACH_PX)));
-        }
-        sum.peak += uintBitsToFloat(sizes.x) * weight * area;
-        sum.spread += uintBitsToFloat(sizes.yz) * (weight / sqrt(area));
-        sum.reach = max(sum.reach, sides);
-        sum.radius = max(sum.radius, radius);
-        weight *= box;
+        vec2 spread_px = uintBitsToFloat(sizes.yz);
+        near = needed_map(map, spread_px.x);
+        far = needed_map(map, spread_px.y);
+        add_end(near, sides, int(sizes.w), sum);
+        add_end(far, sides, int(sizes.w), sum);
+        sum.peak += uintBitsToFloat(sizes.x) * weight * max(near.area, far.area);
+        sum.spread += spread_px * weight / sqrt(vec2(near.area, far.area));
     }
     part[corner] = node;
-    weights[corner] = floatBitsToUint(weight);
-    parts[kernel * uint(PART_WORDS) + 2u + corner] = floatBitsToUint(used_map);
+    near_weights[corner] = weight * near.box;
+    far_weights[corner] = weight * far.box;
+    uint maps = kernel * uint(PART_WORDS) + uint(PART_MAPS) + corner;
+    parts[maps] = floatBitsToUint(near.to_node);
+    parts[maps + uint(FIELD_CORNERS)] = floatBitsToUint(far.to_node);
 }
 
 // Writes the record of a kernel, and asks for its texels at every level that blur as wide
@@ -131,11 +148,14 @@ void plan_kernel(uint kernel) {
     uvec2 pair = pairs[kernel];
     Sizes sum = Sizes(ivec4(0), 0, 0.0, vec2(0.0));
     uvec4 part = uvec4(0u);
-    uvec4 weights = uvec4(0u);
+    vec4 near_weights = vec4(0.0);
+    vec4 far_weights = vec4(0.0);
     for (uint corner = 0u; corner < uint(FIELD_CORNERS); ++corner)
-        add_part(kernel, corner, pair.x, pair.y, part, weights, sum);
-    parts[kernel * uint(PART_WORDS)] = part;
-    parts[kernel * uint(PART_WORDS) + 1u] = weights;
+        add_part(kernel, corner, pair.x, pair.y, part, near_weights, far_weights, sum);
+    uint record = kernel * uint(PART_WORDS);
+    parts[record] = part;
+    parts[record + 1u] = floatBitsToUint(near_weights);
+    parts[record + 2u] = floatBitsToUint(far_weights);
     write_kernel(kernel, sum);
 }
 

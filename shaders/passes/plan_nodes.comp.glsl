@@ -49,8 +49,6 @@ shared uint side_px[RECIPE_TAPS];  // left, right, up, down, radius; the last is
 shared uint first_item;
 shared uint item_count;
 
-const float NODE_SHARE = 5e-4;
-
 // Lower node of defocus of a group, and the share of the upper one.
 uint bracket(uint group, float dpt, out uint upper, out float share) {
     uint first = starts[group];
@@ -67,8 +65,8 @@ uint bracket(uint group, float dpt, out uint upper, out float share) {
     float span = values_dpt[high] - values_dpt[low];
     share = clamp((dpt - values_dpt[low]) / (span > 0.0 ? span : 1.0), 0.0, 1.0);
     // At a node, rounding of 32-bit floats must not read its neighbor, too.
-    if (share < NODE_SHARE) share = 0.0;
-    if (share > 1.0 - NODE_SHARE) share = 1.0;
+    if (share < MIN_NODE_SHARE) share = 0.0;
+    if (share > 1.0 - MIN_NODE_SHARE) share = 1.0;
     return low;
 }
 

@@ -188,12 +188,17 @@ def test_kernels_are_those_of_the_compiled_loops(case):
     assert_work(planned, 0, node_of[used_nodes], node_sizes)
 
     parts = planned.read("PARTS", n, c.PART_WORDS, 4)[numbers]
-    np.testing.assert_allclose(floats(parts[:, 1, :3]), expected.weight_ratio, 1e-5)
-    has_weight = expected.weight_ratio > 0.0
+    weights = floats(parts[:, 1 : c.PART_MAPS, :3])
+    np.testing.assert_allclose(weights, expected.weight_ratio, 1e-5)
+    has_weight = expected.weight_ratio[:, 0] > 0.0
     own = node_of[used_nodes][expected.parts]
     np.testing.assert_array_equal(parts[:, 0, :3][has_weight], own[has_weight])
-    maps = floats(parts[:, 2:]).reshape(n, 3, 2, 2)
-    np.testing.assert_allclose(maps[has_weight], expected.maps[has_weight], 1e-5, 1e-6)
+    maps = floats(parts[:, c.PART_MAPS :]).reshape(n, 2, 3, 2, 2)
+    for end in range(2):
+        found, plain = (
+            all_maps[:, end][has_weight] for all_maps in (maps, expected.maps)
+        )
+        np.testing.assert_allclose(found, plain, 1e-5, 1e-6)
 
     records = planned.read("KERNELS", n, c.KERNEL_WORDS, 4)[numbers]
     np.testing.assert_allclose(floats(records[:, 0, :2]), expected.spread_px, SUM_RTOL)

@@ -120,11 +120,14 @@ def test_blended_kernels_equal_their_twin(gl_engine, rng, mode):
     expected = reference.kernel_pairs(bench.store, kernels)
     starts = records[:, 1]
     step_ratio = np.ascontiguousarray(records[:, 2]).view(np.float32)
+    # mapped reaches may end a pixel earlier than in 64-bit sums, without light there
+    reach_px = np.ascontiguousarray(records[:, 0, 3]).view(np.uint8).reshape(-1, 4)
+    reach_px = reach_px.astype(int)
     line = atlas_line(bench.gpu, "kernels 0")
     largest, levels = expected.shape[2] // 2, set()
     assert kernels.count > (1 if mode == "on-axis" else 50)
     for k in range(0, kernels.count, max(kernels.count // 50, 1)):
-        to_left, to_right, to_top, to_bottom = kernels.reach_px[k]
+        to_left, to_right, to_top, to_bottom = reach_px[k]
         part = (
             slice(largest - to_top, largest + to_bottom + 1),
             slice(largest - to_left, largest + to_right + 1),
