@@ -183,6 +183,12 @@ struct Sum { vec3 light; vec3 coverage; float excess; };
 
 const Sum NOTHING = Sum(vec3(0.0), vec3(0.0), 0.0);
 
+// Share of the light that is in excess of its surroundings.
+float excess_share(Sum sum) {
+    float light = dot(sum.light, vec3(1.0 / float(RGB)));
+    return light > 0.0 ? clamp(sum.excess / light, 0.0, 1.0) : 0.0;
+}
+
 // Of each pixel of the thread: the current group of depths.
 Sum open_sum[PIXELS_PER_THREAD];
 #ifdef IN_ORDER
@@ -194,26 +200,34 @@ Sum near_sum[PIXELS_PER_THREAD];
 Sum seen_sum[PIXELS_PER_THREAD];
 float edge_sum[PIXELS_PER_THREAD];
 
-void add_sum(inout Sum sum, Sum other, vec3 share) {
+void add_sum(inout Sum sum, Sum other, float share) {
     sum.light += share * other.light;
     sum.coverage += share * other.coverage;
-    sum.excess += share.g * other.excess;
+    sum.excess += share * other.excess;
+}
+
+// Adds the fragments of a group.  They share the coverage that nearer ones leave free; light
+// in excess has the free coverage as its share, as if the group's coverage were complete:
+// what it lacks is not as bright.
+void add_behind(inout Sum sum, Sum group) {
+    vec3 room = 1.0 - sum.coverage;
+    vec3 share = min(room / max(group.coverage, vec3(MIN_COVERAGE)), 1.0);
+    vec3 whole = min(room / max(group.coverage, vec3(1.0)), share);
+    sum.light += mix(share, whole, excess_share(group)) * group.light;
+    sum.coverage += share * group.coverage;
+    sum.excess += whole.g * group.excess;
 }
 
 // Adds the current group to the total, and continues with the next one.  Each loop has so
 // few instructions that Mesa unrolls it: sums that it addresses by a variable are slow.
 void close_group() {
     for (int p = 0; p < PIXELS_PER_THREAD; ++p) {
-        add_sum(open_sum[p], next_sum[p], vec3(-1.0));
+        add_sum(open_sum[p], next_sum[p], -1.0);
 #ifndef HAS_HIDDEN
-        add_sum(seen_sum[p], open_sum[p], vec3(1.0));
+        add_sum(seen_sum[p], open_sum[p], 1.0);
 #endif
     }
-    for (int p = 0; p < PIXELS_PER_THREAD; ++p) {
-        vec3 room = 1.0 - near_sum[p].coverage;
-        vec3 share = min(room / max(open_sum[p].coverage, vec3(MIN_COVERAGE)), 1.0);
-        add_sum(near_sum[p], open_sum[p], share);
-    }
+    for (int p = 0; p < PIXELS_PER_THREAD; ++p) add_behind(near_sum[p], open_sum[p]);
     for (int p = 0; p < PIXELS_PER_THREAD; ++p) {
         open_sum[p] = next_sum[p];
         next_sum[p] = NOTHING;
@@ -406,13 +420,11 @@ void add_in_order(int count, ivec2 in_tile, inout float open_group) {
 }
 #endif
 
-// The color of a pixel from its sums.  Coverage changes the excess light neither where it is
-// missing, nor where kernels of different shape add up to more than 1.
+// The color of a pixel from its sums.  Coverage changes light in excess of its surroundings
+// neither where it is missing, nor where it adds up to more than 1.
 vec3 color_of(Sum sum, vec3 own) {
-    float light = dot(sum.light, vec3(1.0 / float(RGB)));
-    float part = light > 0.0 ? clamp(sum.excess / light, 0.0, 1.0) : 0.0;
-    vec3 normalized = sum.light / max(sum.coverage, vec3(MIN_COVERAGE))
-                    * (1.0 - part * (1.0 - sum.coverage));
+    vec3 normalized = sum.light / max(sum.coverage, vec3(MIN_COVERAGE));
+    normalized *= 1.0 - excess_share(sum) * (1.0 - sum.coverage);
     return mix(own, normalized, vec3(greaterThanEqual(sum.coverage, vec3(MIN_COVERAGE))));
 }
 
