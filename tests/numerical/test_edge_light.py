@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from estimator.profiles.parse import parse_profile
+from estimator.psf.tables import N_EDGE
 from filter_service import EyeFilter
 from filter_service.camera import Camera
 from filter_service.planning.plan import plan_cache
@@ -22,6 +23,7 @@ from filter_service.rendering.edge_kinds import (
 from filter_service.rendering.edge_light import EdgeLight
 from filter_service.rendering.engine import ViewRequest
 from filter_service.rendering.frame import white_level
+from filter_service.rendering.light_kernels import seen_by_edges
 from filter_service.rendering.media_effects import begin_through_media, encoded
 from filter_service.rgbd_view import RgbdView
 from filter_service.view_state import State
@@ -196,6 +198,28 @@ def test_a_hidden_lamp_does_not_leak(engine):
     ratio = 1.0 - 0.02  # the lamp is dimmed by the light beyond its kernel
     assert np.all(found <= plain + 1e-7)
     assert np.all(found >= ratio * plain - 1e-7)
+
+
+@pytest.mark.parametrize("beside_px", [1, 3, 5])
+def test_an_edge_hides_a_lamp_gradually(beside_px):
+    """From each element of the pupil's edge, while the pupil grows."""
+    size_px, edge_px = 48, 20
+    depth_m = np.full((size_px, size_px), 4.0, np.float32)
+    depth_m[:, :edge_px] = 0.5
+    color = np.zeros((size_px, size_px, 3), np.float32)
+    color[20, edge_px - 1 + beside_px] = 1.0
+    view = RgbdView(color, depth_m, (-0.1, 0.1, 0.1, -0.1), "radial")
+    pixels = BrightPixels.of(view, 0.0)
+    angle = 2.0 * np.pi * np.arange(N_EDGE) / N_EDGE
+    disc = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    seen = np.concatenate(
+        [
+            seen_by_edges(view, pixels, np.zeros(1, int), shift_px * disc[None])
+            for shift_px in np.linspace(0.2, 4.0, 400)
+        ]
+    )
+    assert seen.min() == 0.0
+    assert np.abs(np.diff(seen, axis=0)).max() < 0.1
 
 
 def test_a_lamp_in_front_is_not_hidden_by_what_is_behind(engine):

@@ -13,8 +13,12 @@
 /* Largest number of steps along a ray, about a pixel each. */
 #define MAX_RAY_STEPS 256
 #define INFINITY_BITS 0x7F800000u
-/* Points along each side of a source whose rays to an edge element are averaged. */
-#define SOURCE_SAMPLES 3
+/* Points of a source whose rays to an edge element are averaged, and rows from each to the
+ * point in the next column. */
+#define SOURCE_SAMPLES 25
+#define SAMPLE_STEP 7
+/* Displacement of rays up to which a source is seen by all elements. */
+#define LEAST_MOVED_PX 0.1
 
 typedef struct {
     const uint32_t *bits;      /* depth (height, width), as integers */
@@ -122,16 +126,26 @@ static double nearest_around(const visibility_job *job, int64_t source, double l
     return found;
 }
 
-/* Returns the share of a source's area that an element sees. */
+/* Returns whether an element sees a point of a source; x and y are from 0 to 1. */
+INLINE int sees_point(const visibility_job *job, int64_t source, double x, double y,
+                      const double *shift_px, const ray_steps *ray) {
+    return !is_blocked(job, (double)job->x_px[source] + x - 0.5,
+                       (double)job->y_px[source] + y - 0.5, shift_px, ray);
+}
+
+/* Returns the share of a source's area that an element sees; corners that agree suffice.  The
+ * points are a lattice of different columns and rows, so that edges pass them one by one. */
 static float seen_share(const visibility_job *job, int64_t source, const double *shift_px,
                         const ray_steps *ray) {
-    double total = 0.0;
-    for (int i = 0; i < SOURCE_SAMPLES * SOURCE_SAMPLES; ++i) {
-        double x = (double)job->x_px[source] + (i % SOURCE_SAMPLES + 0.5) / SOURCE_SAMPLES - 0.5;
-        double y = (double)job->y_px[source] + (i / SOURCE_SAMPLES + 0.5) / SOURCE_SAMPLES - 0.5;
-        total += !is_blocked(job, x, y, shift_px, ray);
-    }
-    return (float)(total / (SOURCE_SAMPLES * SOURCE_SAMPLES));
+    int corners = 0, total = 0;
+    for (int i = 0; i < 4; ++i)
+        corners += sees_point(job, source, i % 2 ? 0.99 : 0.01, i / 2 ? 0.99 : 0.01, shift_px, ray);
+    if (corners % 4 == 0) return (float)(corners / 4);
+    for (int i = 0; i < SOURCE_SAMPLES; ++i)
+        total += sees_point(job, source, (i + 0.5) / SOURCE_SAMPLES,
+                            (SAMPLE_STEP * i % SOURCE_SAMPLES + 0.5) / SOURCE_SAMPLES, shift_px,
+                            ray);
+    return (float)total / (float)SOURCE_SAMPLES;
 }
 
 /* Item: a source. */
@@ -147,19 +161,10 @@ static void see_source(void *argument, int source, int thread) {
     }
     double nearest = nearest_around(job, source, longest_px);
     double moved_px = longest_px * (nearest - own);
-    if (nearest <= own || (moved_px < 0.5 && !job->is_hidden[source])) return;
+    if (nearest <= own || (moved_px < LEAST_MOVED_PX && !job->is_hidden[source])) return;
     int64_t steps = (int64_t)clipped(ceil(moved_px), 1.0, MAX_RAY_STEPS);
     ray_steps ray = {own, (nearest - own) / (double)steps, steps, job->is_hidden[source]};
-    uint8_t is_seen[N_EDGE];
-    for (int m = 0; m < N_EDGE; ++m)
-        is_seen[m] = !is_blocked(job, (double)job->x_px[source], (double)job->y_px[source],
-                                 shift_px + 2 * m, &ray);
-    for (int m = 0; m < N_EDGE; ++m) {
-        int before = is_seen[m > 0 ? m - 1 : N_EDGE - 1], after = is_seen[(m + 1) % N_EDGE];
-        seen[m] = is_seen[m];
-        if (before != is_seen[m] || after != is_seen[m])
-            seen[m] = seen_share(job, source, shift_px + 2 * m, &ray);
-    }
+    for (int m = 0; m < N_EDGE; ++m) seen[m] = seen_share(job, source, shift_px + 2 * m, &ray);
 }
 
 /* Writes which elements (N_EDGE,) of the pupil's edge see each source. */
