@@ -17,6 +17,8 @@
  * point in the next column. */
 #define SOURCE_SAMPLES 25
 #define SAMPLE_STEP 7
+/* If every third element sees the corners of a source, all elements see it. */
+#define PROBE_STEP 3
 /* Displacement of rays up to which a source is seen by all elements. */
 #define LEAST_MOVED_PX 0.1
 
@@ -133,13 +135,20 @@ INLINE int sees_point(const visibility_job *job, int64_t source, double x, doubl
                        (double)job->y_px[source] + y - 0.5, shift_px, ray);
 }
 
+/* Returns how many of its corners an element sees. */
+INLINE int corners_seen(const visibility_job *job, int64_t source, const double *shift_px,
+                        const ray_steps *ray) {
+    int seen = 0;
+    for (int i = 0; i < 4; ++i)
+        seen += sees_point(job, source, i % 2 ? 0.99 : 0.01, i / 2 ? 0.99 : 0.01, shift_px, ray);
+    return seen;
+}
+
 /* Returns the share of a source's area that an element sees; corners that agree suffice.  The
  * points are a lattice of different columns and rows, so that edges pass them one by one. */
 static float seen_share(const visibility_job *job, int64_t source, const double *shift_px,
                         const ray_steps *ray) {
-    int corners = 0, total = 0;
-    for (int i = 0; i < 4; ++i)
-        corners += sees_point(job, source, i % 2 ? 0.99 : 0.01, i / 2 ? 0.99 : 0.01, shift_px, ray);
+    int corners = corners_seen(job, source, shift_px, ray), total = 0;
     if (corners % 4 == 0) return (float)(corners / 4);
     for (int i = 0; i < SOURCE_SAMPLES; ++i)
         total += sees_point(job, source, (i + 0.5) / SOURCE_SAMPLES,
@@ -164,7 +173,11 @@ static void see_source(void *argument, int source, int thread) {
     if (nearest <= own || (moved_px < LEAST_MOVED_PX && !job->is_hidden[source])) return;
     int64_t steps = (int64_t)clipped(ceil(moved_px), 1.0, MAX_RAY_STEPS);
     ray_steps ray = {own, (nearest - own) / (double)steps, steps, job->is_hidden[source]};
-    for (int m = 0; m < N_EDGE; ++m) seen[m] = seen_share(job, source, shift_px + 2 * m, &ray);
+    int hidden = 0;
+    for (int m = 0; m < N_EDGE && !hidden; m += PROBE_STEP)
+        hidden = corners_seen(job, source, shift_px + 2 * m, &ray) < 4;
+    for (int m = 0; m < N_EDGE && hidden; ++m)
+        seen[m] = seen_share(job, source, shift_px + 2 * m, &ray);
 }
 
 /* Writes which elements (N_EDGE,) of the pupil's edge see each source. */
