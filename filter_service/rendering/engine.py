@@ -227,9 +227,10 @@ def with_exact_psfs(engine: FrameEngine, request: ViewRequest) -> ViewRequest:
     Textures whose caller does not wait keep the PSFs of the store: computing those of a
     state takes seconds.
     """
-    spec = request.handle.store.spec
-    is_exact = request.options.render_tolerance == 0.0 and spec.settings.grid != "paper"
-    if not is_exact or spec.is_exact or request.options.accumulation == "paper":
+    if request.options.render_tolerance > 0.0:
+        return request
+    spec, is_paper = request.handle.store.spec, request.options.accumulation == "paper"
+    if spec.is_exact or spec.settings.grid == "paper" or is_paper:
         return request
     if isinstance(request.view, TextureView) and not request.waits:
         return request
