@@ -50,7 +50,7 @@ _VIDEO = ""
 _ESCAPE = re.compile(r"\\(?:\\|x[89a-f][0-9a-f])")
 _FRAME = [("profile", str), ("frame", str), ("ok", bool)]
 _CONTENT = [("bytes", int), ("sha256", str)]
-_COUNTS = ("missing_depth_count", "clamped_depth_count", "overflow_count")
+COUNTS = ("missing_depth_count", "clamped_depth_count", "overflow_count")
 _Failed = defstruct("_Failed", [*_FRAME, ("error", str)])
 _Video = defstruct("_Video", [("profile", str), ("file", str), *_CONTENT])
 _Input = defstruct("_Input", _CONTENT)
@@ -62,7 +62,7 @@ _Done = defstruct(
         *_CONTENT,
         ("inputs", list[_Input]),  # type: ignore[valid-type]
         ("notes", list[str]),
-        *((name, int) for name in _COUNTS),
+        *((name, int) for name in COUNTS),
     ],
 )
 
@@ -447,7 +447,7 @@ def summary_of(manifest: Manifest, wanted: set[tuple[str, str]]) -> dict[str, An
             continue
         n_done[record["profile"]] += 1
         add_notes(notes, record["notes"])
-        for name in _COUNTS:
+        for name in COUNTS:
             pixels[name] += record[name]
     return {
         "frames_done": dict(n_done),

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from clients.batch.manifest import Record, below, write_whole
+from clients.batch.manifest import COUNTS, Record, below, write_whole
 from clients.batch.source import BadFrame, Scaled, SourceFrame, States
 from estimator.bounded_files import read_bytes
 from filter_service import (
@@ -312,9 +312,7 @@ class UnitRunner:
             "ok": True,
             "pupil_mm": seen.pupil_diameter_mm,
             "focus_dpt": seen.focus_dpt,
-            "missing_depth_count": int(seen.missing_depth_count),
-            "clamped_depth_count": int(seen.clamped_depth_count),
-            "overflow_count": int(seen.overflow_count),
+            **{name: seen.counts[name] for name in COUNTS},
             "notes": [*color.notes, *depth.notes, *seen.notes],
             "inputs": inputs,
             "source": frame.described(),

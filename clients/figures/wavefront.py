@@ -377,7 +377,7 @@ def _side_arcmin(states: list[dict[str, list[PupilWavefront]]], name: str) -> fl
 
 
 def _states(study: EyeStudy) -> dict[str, list[PupilWavefront]]:
-    """Return wavefronts of a far point through 3 and 5 mm, as is and corrected."""
+    """Return wavefronts of a far point, uncorrected and corrected, for each pupil."""
     states = [study.far(pupil_mm) for pupil_mm in PUPILS_MM]
     return {
         "as it is": states,
@@ -391,7 +391,7 @@ def draw_psfs(
     *,
     sides_arcmin: tuple[float, float] | None = None,
 ) -> None:
-    """Draw PSFs of a far point through 3 and 5 mm: as it is, and best corrected.
+    """Draw PSFs of a far point through 3 and 5 mm, uncorrected and best corrected.
 
     Parameters
     ----------

@@ -27,7 +27,7 @@ MAX_TERMS = (HIGHEST_ORDER + 1) * (HIGHEST_ORDER + 2) // 2
 
 @cache
 def radial_order(n_terms: int) -> int:
-    """Return the radial order of an array's number of terms, 6 for 28.
+    """Return the radial order that has a number of terms, for example 6 for 28.
 
     Raises
     ------
@@ -76,7 +76,7 @@ def padded_terms(coefficients: ArrayLike, n_terms: int) -> NDArray[np.float64]:
     Raises
     ------
     ValueError
-        There are more terms than that.
+        There are more than ``n_terms`` terms.
     """
     coefficients = np.asarray(coefficients, dtype=np.float64)
     missing = n_terms - coefficients.shape[-1]
@@ -116,7 +116,7 @@ def index_from_nm(n: int, m: int) -> int:
 
 
 def summed_terms(*parts: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the sum of coefficients or monomials, with the most terms of its parts."""
+    """Return the sum of coefficients or monomials, padded to the longest of them."""
     n_terms = max(part.shape[-1] for part in parts)
     total = padded_terms(parts[0], n_terms)
     for part in parts[1:]:

@@ -92,7 +92,8 @@ the 200 eyes, without `POOL_RATIO`."""
 
 SAME_AZIMUTH_CORRELATION = {(3, 5): -0.2, (4, 6): -0.4}
 """Correlation of terms of two orders with the same azimuthal order, which is not 0, in
-the eyes of Thibos et al.  Without it, drawn persons have 10 % too little at 3 mm."""
+the eyes of Thibos et al.  Without it, the RMS of drawn persons is 10 % too low at 3
+mm."""
 
 FREEDOM = 7
 """Degrees of freedom of the multivariate t-distribution of drawn persons.  The RMS has
@@ -113,7 +114,7 @@ YOUNG_ADULT_YEARS = 25.0
 
 
 AXIS_STREAM = 0
-"""Second seed of the random numbers of the axis; `periphery.change` has another."""
+"""Second seed of the random on-axis aberrations; `periphery.change` has another."""
 
 
 def typical_zernike_um(
@@ -196,7 +197,7 @@ def _growth_um(age_years: float | None) -> NDArray[np.float64]:
 def _in_eye_frame(
     zernike_um: NDArray[np.float64], eye_side: str
 ) -> NDArray[np.float64]:
-    """Return coefficients of a right eye in the examiner's frame in the eye frame."""
+    """Convert coefficients of a right eye from the examiner's to the eye's frame."""
     return flip_horizontal(zernike_um) if eye_side == "OD" else zernike_um
 
 

@@ -55,10 +55,8 @@ class Filtered(FrameCounts, WithState):
     ----------
     views : tuple of ViewResult
         One for each view of the frame.
-    missing_depth_count, clamped_depth_count, bad_color_count, overflow_count : int
-        Number of pixels whose depth was missing and filled in; whose depth was outside
-        the prepared range; whose color was not finite; and number of list entries lost
-        to full buffers.
+    missing_depth_count and the other attributes of `FrameCounts` : int
+        Sums over the views.
     notes : tuple of str
         Notes for the user; those about a left or right eye name it.
     stage_times_ms : dict
