@@ -32,18 +32,18 @@ FINE_PARTS = 1
 """Parts of each interval between the field nodes of an eye's plan, by mode, and added
 parts with tolerance "fine"."""
 
-LAYER_STEP_RATIO = {"on-axis": 0.2, "quality": 0.3, "dynamic": 0.25}
+LAYER_STEP_RATIO = {"on-axis": 0.2, "quality": 0.2, "dynamic": 0.15}
 FINE_STEP_RATIO = 0.5
 """Steps between layers relative to the default, by mode, and the factor of "fine"."""
 
-RAYS_FROM_DB = {"on-axis": 64.0, "quality": 60.0, "dynamic": 60.0}
-FINE_DB = 4.0
+RAYS_FROM_DB = {"on-axis": 64.0, "quality": 64.0, "dynamic": 60.0}
+FINE_DB = 2.0
 """Predicted PSNR from which PSFs are computed by ray optics, by mode, and what "fine"
 adds.  Ray optics misplaces up to 5.6 % of the light, wave optics 0.9 %, and 0.26 % with
 the accuracy that the modes on-axis and quality use."""
 
-KEPT_ENERGY_RATIO = 0.998
-"""Share of light within a kernel's box."""
+KEPT_ENERGY_RATIO, FINE_ENERGY_RATIO = 0.998, 0.9985
+"""Share of light within a kernel's box, and the same with "fine"."""
 
 
 class ExactStore(PsfStore):
@@ -83,7 +83,7 @@ class ExactStore(PsfStore):
         layers = frame_layers(base, state, step_ratio=step_ratio)
         spec = replace(
             base.spec.with_settings(gaze_deg=state.gaze_deg, gaze_range_deg=(0.0, 0.0)),
-            kept_energy_ratio=KEPT_ENERGY_RATIO,
+            kept_energy_ratio=FINE_ENERGY_RATIO if is_fine else KEPT_ENERGY_RATIO,
             rays_from_db=RAYS_FROM_DB[settings.mode] + (FINE_DB if is_fine else 0.0),
             is_exact=True,
         )

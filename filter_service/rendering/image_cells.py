@@ -90,7 +90,7 @@ TEXELS_PER_PIXEL = 10.0
 the cells become twice as wide to save memory.  With 16 bytes per texel, the limit is
 150 MB at 1280x720."""
 
-EXACT_CELL_DEG = {"loose": 1.0, "normal": 1.0, "fine": 0.5}
+EXACT_CELL_DEG = {"quality": 0.5, "dynamic": 1.0}
 """The same for frames with a render tolerance of 0, whose pixels blend the kernels of
 cells."""
 
@@ -292,7 +292,7 @@ def default_cell_px(spec: GridSpec, *, blends: bool = False) -> int:
     pixel_deg = math.degrees(min(spec.pixel_pitch_mrad) / 1000.0)
     cell_deg, least_px = CELL_DEG[spec.settings.mode], MIN_CELL_PX
     if spec.is_exact:
-        cell_deg, least_px = EXACT_CELL_DEG[spec.settings.tolerance], 1
+        cell_deg, least_px = EXACT_CELL_DEG[spec.settings.mode], 1
         if not blends:
             cell_deg /= 4.0
     power = math.floor(math.log2(max(cell_deg / pixel_deg, 1.0)))
