@@ -29,10 +29,11 @@ FRAGMENT = np.dtype(
 FRAGMENT_LIGHT = np.dtype(
     [
         ("rgb", "<f4", 3),
-        ("depth", "<f4"),
         ("strength", "<f4"),
         ("coverage", "<f4"),
         ("excess", "<f4"),
+        ("depth", "<f4"),
+        ("spare", "<f4"),
     ]
 )
 BLOCK = np.dtype(

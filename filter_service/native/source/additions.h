@@ -121,17 +121,14 @@ static void add_both(const addition *a, const addition *b) {
 INLINE int prepare_addition(const frame *f, uint32_t index, float share, depth_group *group,
                             addition *a) {
     const fragment *one = f->fragments + index;
-    const fragment_light *light = f->lights + index;
+    const float *light = (const float *)(f->lights + index);
     const level_image *image = image_of(f, one);
     raster *own = group->sizes + image->resolution;
     reading r = start_reading(one, image, own);
     meeting m = meet(&r, own);
     if (m.pairs <= 0 || m.rows <= 0) return 0;
     if (f->blend_shares != NULL) share *= f->blend_shares[index];
-    float scale = image->scale * share;
-    float red = scale * light->rgb[0], green = scale * light->rgb[1];
-    float blue = scale * light->rgb[2], strength = scale * light->strength;
-    float coverage = scale * light->coverage, excess = scale * light->excess;
+    f32x4 scale = all4(image->scale * share);
     light_raster(own);
     a->to = own->pairs + (m.row + r.top) * own->stride + m.pair;
     a->to_stride = own->stride;
@@ -140,9 +137,8 @@ INLINE int prepare_addition(const frame *f, uint32_t index, float share, depth_g
     a->from = row_texels(f, &r, m.row) + 8 * m.pair;
     a->from_stride = 4 * (image->width + 1);
     a->factors = r.factors;
-    a->color = (f32x8){red, green, blue, strength, red, green, blue, strength};
-    a->scales = (f32x8){coverage, coverage, coverage, excess,
-                        coverage, coverage, coverage, excess};
+    a->color = twice4(load4(light) * scale);
+    a->scales = twice4(first_thrice4(load4(light + 4) * scale));
     return 1;
 }
 

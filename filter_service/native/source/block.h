@@ -18,7 +18,7 @@ typedef struct {
     float spread_px[BLOCK_PIXELS];
     uint32_t kernel[BLOCK_PIXELS];
     float share[BLOCK_PIXELS];       /* strength of an edge; on the hidden surface, coverage */
-    float bright[RGB];        /* light above which it is not amplified */
+    f32x4 bright;             /* light above which it is not amplified */
     uint64_t held;            /* pixels that are not empty */
     uint64_t edges;           /* pixels next to another surface, or hidden */
     int highest_level;        /* of merging, over the pixels' kernels */
@@ -197,7 +197,7 @@ INLINE void set_bright(block *b, int column, int row) {
     for (int y = larger_int(row - 1, 0); y < bottom; ++y)
         for (int x = larger_int(column - 1, 0); x < right; ++x)
             sum += load4(f->block_light + 4 * (y * f->block_columns + x));
-    for (int c = 0; c < RGB; ++c) b->bright[c] = EXCESS_RATIO * sum[c] / sum[3];
+    b->bright = all4(EXCESS_RATIO / sum[3]) * sum;
 }
 
 /* Reads a block; empty pixels stay dark and sharp. */

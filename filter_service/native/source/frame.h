@@ -52,10 +52,11 @@ typedef struct {
 
 typedef struct {
     float rgb[RGB];           /* times the coverage */
-    float depth;              /* sort depth, smaller is nearer */
     float strength;           /* of an edge of the visible surface, 0 to 1 */
     float coverage;           /* less than 1 if hidden in part, or one cell's part of a pixel */
     float excess;             /* light that missing coverage does not amplify */
+    float depth;              /* sort depth, smaller is nearer */
+    float spare;              /* the first and the last four are read as vectors */
 } fragment_light;
 
 enum { BOX_LEFT, BOX_RIGHT, BOX_TOP, BOX_BOTTOM };

@@ -82,10 +82,11 @@ INLINE f32x8 fade_lanes(f32x8 value, f32x8 limit) {
     return (limit - value) / margin + all8(1.0f);
 }
 
-/* Bit mask of the squares that blur allows to merge into one fragment, and how far each may be
- * moved toward its mean (`fade`, up to 1 and more).  Relative to twice the blur, a square of the
+/* Bit mask of the squares that blur allows to merge into one fragment, and of those that do not
+ * miss a limit by far (`close`), with their share of the way to their mean.  Relative to twice the blur, a square of the
  * next level looks the same, and so does its error. */
-INLINE uint32_t similar_lanes(const block *b, const square_row *s, int level, f32x8 *fade) {
+INLINE uint32_t similar_lanes(const block *b, const square_row *s, int level, uint32_t *close,
+                              float *fade) {
     const frame *f = b->f;
     f32x8 spread = s->spread_px * all8(1.0f / (float)(1 << (level - 1)));
     f32x8 contrast = seen_contrast(f, s, 0);
@@ -97,11 +98,20 @@ INLINE uint32_t similar_lanes(const block *b, const square_row *s, int level, f3
     /* Farther apart, there may be no kernel between them. */
     i32x8 near = whole8(s->farthest) - whole8(s->nearest) <= 1;
     f32x8 least = all8(b->smallest_spread_px);
-    f32x8 smallest = (spread - least) / (all8(MERGE_FADE_RATIO) * least) + all8(1.0f);
-    smallest = smaller8(smallest, fade_lanes(contrast, most));
-    smallest = smaller8(smallest, fade_lanes(blur_px, most_px));
-    *fade = (f32x8)((i32x8)smallest & near);
-    return bits_of8((spread >= least) & (contrast <= most) & (blur_px <= most_px) & near);
+    uint32_t similar =
+        bits_of8((spread >= least) & (contrast <= most) & (blur_px <= most_px) & near);
+    f32x8 more = all8(1.0f + MERGE_FADE_RATIO);
+    *close = similar
+             | bits_of8((spread > all8(1.0f - MERGE_FADE_RATIO) * least)
+                        & (contrast < more * most) & (blur_px < more * most_px) & near);
+    f32x8 smallest = all8(1.0f);
+    if (*close != similar) {
+        smallest += (spread - least) / (all8(MERGE_FADE_RATIO) * least);
+        smallest = smaller8(smallest, fade_lanes(contrast, most));
+        smallest = smaller8(smallest, fade_lanes(blur_px, most_px));
+    }
+    store8(fade, smallest);
+    return similar;
 }
 
 INLINE float lane_of(const f32x8 *lanes, int lane) { return ((const float *)lanes)[lane]; }
@@ -156,7 +166,7 @@ INLINE void merge_level(const block *b, block_squares *all, int level) {
     uint64_t below = level == 1 ? b->held : all->merged[level - 1] | all->fading[level - 1];
     uint64_t starts = starts_of_four(below, level);
     if (starts == 0) return;
-    uint64_t similar = 0, near = 0;
+    uint64_t similar = 0, close = 0;
     for (int row = 0; row < TILE_SIZE_PX >> level; ++row) {
         square_row *to = &all->rows[level - 1][row];
         if (level == 1) {
@@ -167,13 +177,13 @@ INLINE void merge_level(const block *b, block_squares *all, int level) {
             join_rows(from, from + 1, level, to);
         }
         int first = row * TILE_SIZE_PX << level;
-        f32x8 fade;
-        similar |= (uint64_t)similar_lanes(b, to, level, &fade) << first;
-        near |= (uint64_t)bits_of8(fade > all8(0.0f)) << first;
-        store8(all->fade[level] + first, fade);
+        uint32_t row_close;
+        similar |= (uint64_t)similar_lanes(b, to, level, &row_close, all->fade[level] + first)
+                   << first;
+        close |= (uint64_t)row_close << first;
     }
     uint64_t full = similar & starts_of_four(whole, level);
-    for (uint64_t left = starts & (near | similar); left; left &= left - 1) {
+    for (uint64_t left = starts & close; left; left &= left - 1) {
         int i = __builtin_ctzll(left);
         uint64_t bit = left & -left;
         const square_row *s = &all->rows[level - 1][i / TILE_SIZE_PX >> level];
