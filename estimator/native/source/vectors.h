@@ -182,10 +182,12 @@ INLINE f32x8 across8(f32x8 value, int level) {
 
 /* Four values twice. */
 INLINE f32x8 twice4(f32x4 value) {
-    f32x8 both;
-    memcpy(&both, &value, sizeof value);
-    memcpy((char *)&both + sizeof value, &value, sizeof value);
-    return both;
+#if defined(__clang__) || __GNUC__ >= 12
+    return __builtin_shufflevector(value, value, 0, 1, 2, 3, 4, 5, 6, 7);
+#else
+    return (f32x8){value[0], value[1], value[2], value[3],
+                   value[0], value[1], value[2], value[3]};
+#endif
 }
 
 /* The first value three times, then the second. */
