@@ -142,7 +142,14 @@ def test_lists_equal_those_of_all_pairs(bench, rng, rule, surface_count, reach_p
     assert np.array_equal(offsets, expected.offsets[:-1])
     assert passes.lists.entry_count == lengths.sum()
     assert np.array_equal(counts[:, 1], expected.ordered_tiles)
+    assert np.array_equal(counts[:, 3], expected.hidden_tiles)
     assert not counts[:, 2].any()
+    room = constants.TILES_PER_BIN * len(lengths)
+    found = read(bench, "TILES", (constants.TILE_KINDS, room), np.uint32)
+    for kind, tiles in enumerate(tile_lists.expected_tiles(expected, (WIDTH, HEIGHT))):
+        assert passes.lists.tiles[kind] == len(tiles)
+        filled = np.append(tiles, [constants.NO_INDEX] * (-len(tiles) % 4))
+        assert np.array_equal(found[kind, : filled.size], filled)
     assert passes.lists.longest == lengths.max()
     assert passes.lists.overflow_count == 0
     sorted_bins = 0

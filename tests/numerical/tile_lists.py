@@ -36,10 +36,15 @@ class Fragments:
 
 @dataclass(frozen=True)
 class Lists:
-    """``entries[b]`` (n,) of bin b; tiles whose order matters (n_bins,), and starts."""
+    """``entries[b]`` (n,) of bin b; bits of tiles (n_bins,), and starts.
+
+    Order matters in ``ordered_tiles``, and light of a hidden surface reaches
+    ``hidden_tiles``.
+    """
 
     entries: list
     ordered_tiles: np.ndarray
+    hidden_tiles: np.ndarray
     offsets: np.ndarray
 
 
@@ -80,7 +85,7 @@ def expected_lists(fragments, size_px, *, hidden_from, order_always=False):
     tiles = [-(-side // TILE_SIZE_PX) for side in size_px]
     columns, rows = (-(-side // BIN_TILES) for side in tiles)
     hidden = fragments.slots >= hidden_from
-    entries, ordered = [], []
+    entries, ordered, covered = [], [], []
     for bin_index in range(columns * rows):
         masks = np.zeros(len(fragments.slots), np.uint32)
         for i in range(TILES_PER_BIN):
@@ -93,13 +98,31 @@ def expected_lists(fragments, size_px, *, hidden_from, order_always=False):
         entries.append((slots << np.uint32(TILES_PER_BIN)) | masks[kept])
         matters = fragments.is_edge | hidden
         ordered.append(np.bitwise_or.reduce(masks[matters], initial=0))
+        covered.append(np.bitwise_or.reduce(masks[hidden], initial=0))
     counts = [len(of_bin) for of_bin in entries]
     ordered = np.array(ordered, np.uint32)
     return Lists(
         entries=entries,
         ordered_tiles=ordered | (2**TILES_PER_BIN - 1 if order_always else 0),
+        hidden_tiles=np.array(covered, np.uint32) * (not order_always),
         offsets=np.concatenate([[0], np.cumsum(counts)]),
     )
+
+
+def expected_tiles(lists, size_px):
+    """Tiles of each kind: without order, in order, and with a hidden surface."""
+    tiles = [-(-side // TILE_SIZE_PX) for side in size_px]
+    columns = -(-tiles[0] // BIN_TILES)
+    kinds = [[], [], []]
+    for bin_index, ordered in enumerate(lists.ordered_tiles):
+        for i in range(TILES_PER_BIN):
+            x = (bin_index % columns) * BIN_TILES + i % BIN_TILES
+            y = (bin_index // columns) * BIN_TILES + i // BIN_TILES
+            if x < tiles[0] and y < tiles[1]:
+                hidden = lists.hidden_tiles[bin_index]
+                kind = (ordered >> i & 1) + (ordered & hidden) // 2**i % 2
+                kinds[kind].append(bin_index * TILES_PER_BIN + i)
+    return kinds
 
 
 def expected_windows(blocks, tile_grid, surface_count):
