@@ -59,13 +59,14 @@ void add_node(uint part, uint index, ivec2 at, inout vec3 near, inout vec3 far) 
     vec2 high = max(near_cover.high, far_cover.high);
     ivec2 first = max(ivec2(floor(low + 0.5)), -ivec2(reach.left, reach.up));
     ivec2 last = min(ivec2(ceil(high - 0.5)), ivec2(reach.right, reach.down));
-    for (int y = first.y; y <= last.y; ++y) {
-        for (int x = first.x; x <= last.x; ++x) {
-            int texel = int(place.z) + reach_texel(reach, ivec2(x, y));
-            uvec4 ends = ATLAS_FETCH(node_atlas, texel);
-            near += weight.x * covered(near_cover, vec2(x, y)) * near_weights(ends);
-            far += weight.y * covered(far_cover, vec2(x, y)) * far_weights(ends);
-        }
+    if (first.x > last.x) return;
+    // One loop: llvmpipe executes each loop once more than its condition holds.
+    for (ivec2 stored = first; stored.y <= last.y;) {
+        uvec4 ends = ATLAS_FETCH(node_atlas, int(place.z) + reach_texel(reach, stored));
+        near += weight.x * covered(near_cover, vec2(stored)) * near_weights(ends);
+        far += weight.y * covered(far_cover, vec2(stored)) * far_weights(ends);
+        bool row_ends = stored.x == last.x;
+        stored = row_ends ? ivec2(first.x, stored.y + 1) : stored + ivec2(1, 0);
     }
 }
 
