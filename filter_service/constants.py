@@ -34,13 +34,13 @@ TOTAL_ENTRIES_FLOAT = 1
 TOTAL_LOST = 2
 TOTAL_LONGEST = 3
 TOTAL_TILES = 4
-TILE_KINDS = 3
+TILE_KINDS = 4
 TOTAL_WORDS = TOTAL_TILES + TILE_KINDS
 """Words after the bins' offsets: entries of all lists, the same as a float, dropped
 entries, length of the longest list, tiles of each kind: those in which order does not
-matter, those in which it does, and of these the ones that light of a hidden surface
-reaches.  The splat has a dispatch for each kind, because llvmpipe executes both sides
-of every branch."""
+matter, those in which it does, of these the ones that light of a hidden surface
+reaches, and of the first the ones with excess light.  The splat has a dispatch for each
+kind, because llvmpipe executes both sides of every branch."""
 
 STAT_MISSING = 0
 STAT_CLAMPED = 1
@@ -196,6 +196,7 @@ KERNEL_MASK = 0xFFFFFFF
 LEVEL_SHIFT = 28
 LEVEL_MASK = 3
 EDGE_BIT = 0x40000000
+BRIGHT_BIT = 0x80000000
 """Packing of a fragment's position and state words (shaders/README.md)."""
 
 ATLAS_WIDTH_BITS = 12

@@ -1,6 +1,6 @@
 // A fragment: a pixel or a merged square of 2^level pixels of the input, with its blur.
 // color.rgb is linear light; color.a the sort depth (smaller = nearer).
-// place: x | y << 16 (first pixel), kernel | level | flag, fraction of the kernel's
+// place: x | y << 16 (first pixel), kernel | level | flags, fraction of the kernel's
 // interval in 16 bits | radius of the kernel << 16, reach of the kernel (common/reach.glsl).
 // edge: strength of the edge, or of a hidden fragment its coverage, with which its light is
 // multiplied; light in excess of the surroundings, mean of the channels.
@@ -21,6 +21,7 @@ uvec4 pack_place(Fragment fragment) {
     uint state = fragment.kernel;
     state |= uint(fragment.level) << LEVEL_SHIFT;
     state |= fragment.edge.x > 0.0 ? EDGE_BIT : 0u;
+    state |= fragment.edge.y > 0.0 ? uint(BRIGHT_BIT) : 0u;
     uint place = uint(fragment.origin_px.x) | (uint(fragment.origin_px.y) << PLACE_BITS);
     uint fraction = uint(fragment.layer_fraction * float(PLACE_MASK) + 0.5);
     return uvec4(place, state, fraction | (uint(fragment.radius_px) << PLACE_BITS),

@@ -2,7 +2,8 @@
 // surfaces meet, so that order matters.
 // In:  FRAGMENT_PLACE, BLOCKS, PLAN.   Out: BIN_COUNTS (kept, a bit for each tile whose order
 //      matters, entries beyond the capacity of a list, a bit for each tile that light of a
-//      hidden surface reaches, unless order always matters), WINDOWS (blocks that reach a bin).
+//      hidden surface reaches, and above these that excess light reaches, unless order
+//      always matters), WINDOWS (blocks that reach a bin).
 // Dispatch: one group of GROUP_THREADS per bin: 8 on a software renderer, so that its
 //      vectors are full, THREADS on hardware.
 // Twin: tests/numerical/tile_lists.py (lists by comparing all pairs).
@@ -29,6 +30,7 @@ uniform int order_always;
 shared uint total;
 shared uint ordered_tiles;
 shared uint hidden_tiles;
+shared uint bright_tiles;
 shared int window_low[2];
 shared int window_high[2];
 
@@ -64,6 +66,7 @@ void main() {
         total = 0u;
         ordered_tiles = order_always != 0 ? uint(ALL_TILES) : 0u;
         hidden_tiles = 0u;
+        bright_tiles = 0u;
         for (int axis = 0; axis < 2; ++axis) {
             window_low[axis] = tile_grid[axis];
             window_high[axis] = 0;
@@ -77,6 +80,7 @@ void main() {
     uint count = 0u;
     uint edges = 0u;
     uint covered = 0u;
+    uint bright = 0u;
     Stretch stretch;
     while (next_stretch(walk, stretch)) {
         // Where light of a hidden surface arrives, a surface lies in front of it.
@@ -87,15 +91,20 @@ void main() {
             count += tiles != 0u ? 1u : 0u;
             edges |= (place.y & EDGE_BIT) != 0u ? tiles : 0u;
             covered |= is_hidden ? tiles : 0u;
+            bright |= (place.y & uint(BRIGHT_BIT)) != 0u ? tiles : 0u;
         }
     }
     atomicAdd(total, count);
     atomicOr(ordered_tiles, edges | covered);
-    if (order_always == 0) atomicOr(hidden_tiles, covered);
+    if (order_always == 0) {
+        atomicOr(hidden_tiles, covered);
+        atomicOr(bright_tiles, bright);
+    }
     barrier();  // all threads have added
     if (gl_LocalInvocationIndex == 0u) {
         uint kept = min(total, list_capacity);
         windows[index] = window;
-        counts[index] = uvec4(kept, ordered_tiles, total - kept, hidden_tiles);
+        counts[index] = uvec4(kept, ordered_tiles, total - kept,
+                              hidden_tiles | (bright_tiles << uint(TILES_PER_BIN)));
     }
 }

@@ -26,7 +26,7 @@ layout(std430, binding = BINDING_TILES) writeonly buffer Tiles { uint tiles[]; }
 uniform ivec2 tile_grid;
 uniform int bin_columns;
 
-shared uvec3 kind_sums[SCAN_THREADS];
+shared uvec4 kind_sums[SCAN_THREADS];
 shared uint sums[SCAN_THREADS];
 shared float float_sums[SCAN_THREADS];
 shared uint lost_count;
@@ -37,12 +37,14 @@ uint kind_of(int bin, uvec4 count, int in_bin) {
     ivec2 tile = ivec2(bin % bin_columns, bin / bin_columns) * BIN_TILES
                + ivec2(in_bin % BIN_TILES, in_bin / BIN_TILES);
     if (any(greaterThanEqual(tile, tile_grid))) return uint(TILE_KINDS);
-    uint ordered = (count.y >> uint(in_bin)) & 1u;
-    return ordered + (ordered & (count.w >> uint(in_bin)));
+    uint hidden = (count.w >> uint(in_bin)) & 1u;
+    uint bright = (count.w >> uint(TILES_PER_BIN + in_bin)) & 1u;
+    bool is_ordered = ((count.y >> uint(in_bin)) & 1u) != 0u;
+    return is_ordered ? 1u + hidden : bright * uint(TILE_KINDS - 1);
 }
 
 // Lists the tiles of a thread's bins by kind, after those of the threads before it.
-void list_tiles(int first, int end, uvec3 at) {
+void list_tiles(int first, int end, uvec4 at) {
     uint room = uint(bin_count * TILES_PER_BIN);
     for (int bin = first; bin < end; ++bin) {
         uvec4 count = counts[bin];
@@ -68,7 +70,7 @@ void main() {
     uint lost = 0u;
     uint most = 0u;
     float float_sum = 0.0;
-    uvec3 kinds = uvec3(0u);
+    uvec4 kinds = uvec4(0u);
     for (int bin = first; bin < end; ++bin) {
         uvec4 count = counts[bin];
         sum += count.x;
@@ -88,7 +90,7 @@ void main() {
     atomicAdd(lost_count, lost);
     uint start = 0u;
     float float_start = 0.0;
-    uvec3 kind_start = uvec3(0u);
+    uvec4 kind_start = uvec4(0u);
     for (int other = 0; other < thread; ++other) {
         kind_start += kind_sums[other];
         start += sums[other];

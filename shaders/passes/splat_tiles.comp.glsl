@@ -14,7 +14,8 @@
 //      free, so that no part of a partly hidden surface is accumulated before the rest;
 //      fragments near the far end of a group belong to the next one in part.  Where little
 //      light of edges arrives, part of the sum without order.  HAS_HIDDEN: which leaves
-//      out the hidden surface.
+//      out the hidden surface.  HAS_EXCESS: of fragments, some of whose light exceeds that
+//      around them.
 // Twin: reference.gather.
 // Source: Csoba & Kunkli 2023, section 6.1; accumulation as in shaders/README.md.
 
@@ -61,7 +62,7 @@ shared uvec4 staged_mark[BATCH];      // x: lit columns and rows of the tile, a 
                                       // the factors of the kernel's two ends.  Before
                                       // staging x is the slot: with little shared memory
                                       // many groups can run at once
-#ifndef PAPER_RULE
+#ifdef HAS_EXCESS
 shared uint bright[HIT_WORDS];        // bit per staged fragment: it has excess light
 #endif
 #ifdef IN_ORDER
@@ -106,15 +107,18 @@ void stage(uint slot, int at, ivec2 tile_first) {
     uint rows = bits_between(first.y, last.y);
     float scale = kernel_scale(kernel, level) / WEIGHT_MAX;
     float excess = 0.0;
-#ifndef PAPER_RULE
+#ifdef HAS_EXCESS
     vec2 edge = edges[slot];
-    bool is_hidden = slot >= uint(tile_grid.x * tile_grid.y * THREADS);
+    bool is_hidden = false;
+#ifdef HAS_HIDDEN
     // The light of a hidden fragment is multiplied with its coverage, and the weights are, too.
+    is_hidden = slot >= uint(tile_grid.x * tile_grid.y * THREADS);
     if (is_hidden) {
         scale *= edge.x;
         color.rgb /= edge.x;
         edge.y /= edge.x;
     }
+#endif
 #ifdef IN_ORDER
     staged_order[at] = vec2(group_of(color.a), is_hidden ? -1.0 : edge.x / float(RGB));
 #endif
@@ -160,7 +164,7 @@ int stage_batch(uint batch, uint end, uint tile_bit, ivec2 tile_first) {
     uint found = find_hits(batch + mine, end, tile_bit);
     if (gl_LocalInvocationIndex < uint(HIT_WORDS)) hits[gl_LocalInvocationIndex] = 0u;
     barrier();  // the last batch is done, and the bits are clear
-#ifndef PAPER_RULE
+#ifdef HAS_EXCESS
     if (gl_LocalInvocationIndex < uint(HIT_WORDS)) bright[gl_LocalInvocationIndex] = 0u;
 #endif
     atomicOr(hits[mine / uint(BITS_PER_WORD)], found << (mine % uint(BITS_PER_WORD)));
@@ -332,7 +336,7 @@ void add_fragments(int at, int end, ivec2 in_tile) {
     }
 }
 
-#ifndef PAPER_RULE
+#ifdef HAS_EXCESS
 // The first staged fragment from `at` on that has excess light; not before `end` if there is
 // none.
 int next_bright(int at, int end) {
@@ -456,7 +460,7 @@ void main() {
         add_in_order(staged, in_tile, open_group);
 #else
         add_fragments(0, staged, in_tile);
-#ifndef PAPER_RULE
+#ifdef HAS_EXCESS
         add_excess(0, staged, in_tile, open_group);
 #endif
 #endif

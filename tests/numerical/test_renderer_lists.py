@@ -69,6 +69,7 @@ def random_buffers(rng, tile_count, columns, surface_count, *, reach_px):
     radius = rng.integers(0, reach_px + 1, slots)
     sides = (rng.random((slots, 4)) * (radius[:, None] + 1)).astype(np.uint8)
     edge = (rng.random(slots) < 0.002) * constants.EDGE_BIT
+    edge |= (rng.random(slots) < 0.01) * constants.BRIGHT_BIT
     place = np.stack(
         [
             x | y << constants.PLACE_BITS,
@@ -142,7 +143,8 @@ def test_lists_equal_those_of_all_pairs(bench, rng, rule, surface_count, reach_p
     assert np.array_equal(offsets, expected.offsets[:-1])
     assert passes.lists.entry_count == lengths.sum()
     assert np.array_equal(counts[:, 1], expected.ordered_tiles)
-    assert np.array_equal(counts[:, 3], expected.hidden_tiles)
+    bright = expected.bright_tiles << constants.TILES_PER_BIN
+    assert np.array_equal(counts[:, 3], expected.hidden_tiles | bright)
     assert not counts[:, 2].any()
     room = constants.TILES_PER_BIN * len(lengths)
     found = read(bench, "TILES", (constants.TILE_KINDS, room), np.uint32)

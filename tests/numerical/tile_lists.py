@@ -6,6 +6,7 @@ import numpy as np
 
 from filter_service.constants import (
     BIN_TILES,
+    BRIGHT_BIT,
     EDGE_BIT,
     LEVEL_MASK,
     LEVEL_SHIFT,
@@ -31,6 +32,7 @@ class Fragments:
     sides: np.ndarray
     radius_px: np.ndarray
     is_edge: np.ndarray
+    is_bright: np.ndarray
     depth: np.ndarray
 
 
@@ -38,13 +40,14 @@ class Fragments:
 class Lists:
     """``entries[b]`` (n,) of bin b; bits of tiles (n_bins,), and starts.
 
-    Order matters in ``ordered_tiles``, and light of a hidden surface reaches
-    ``hidden_tiles``.
+    Order matters in ``ordered_tiles``; light of a hidden surface reaches
+    ``hidden_tiles``, and excess light ``bright_tiles``.
     """
 
     entries: list
     ordered_tiles: np.ndarray
     hidden_tiles: np.ndarray
+    bright_tiles: np.ndarray
     offsets: np.ndarray
 
 
@@ -63,6 +66,7 @@ def unpack_fragments(blocks, place, color):
         sides=sides.astype(int),
         radius_px=(place[:, 2] >> PLACE_BITS).astype(int),
         is_edge=(place[:, 1] & EDGE_BIT) != 0,
+        is_bright=(place[:, 1] & BRIGHT_BIT) != 0,
         depth=color[slots, 3],
     )
 
@@ -85,7 +89,7 @@ def expected_lists(fragments, size_px, *, hidden_from, order_always=False):
     tiles = [-(-side // TILE_SIZE_PX) for side in size_px]
     columns, rows = (-(-side // BIN_TILES) for side in tiles)
     hidden = fragments.slots >= hidden_from
-    entries, ordered, covered = [], [], []
+    entries, ordered, covered, bright = [], [], [], []
     for bin_index in range(columns * rows):
         masks = np.zeros(len(fragments.slots), np.uint32)
         for i in range(TILES_PER_BIN):
@@ -99,28 +103,33 @@ def expected_lists(fragments, size_px, *, hidden_from, order_always=False):
         matters = fragments.is_edge | hidden
         ordered.append(np.bitwise_or.reduce(masks[matters], initial=0))
         covered.append(np.bitwise_or.reduce(masks[hidden], initial=0))
+        bright.append(np.bitwise_or.reduce(masks[fragments.is_bright], initial=0))
     counts = [len(of_bin) for of_bin in entries]
     ordered = np.array(ordered, np.uint32)
     return Lists(
         entries=entries,
         ordered_tiles=ordered | (2**TILES_PER_BIN - 1 if order_always else 0),
         hidden_tiles=np.array(covered, np.uint32) * (not order_always),
+        bright_tiles=np.array(bright, np.uint32) * (not order_always),
         offsets=np.concatenate([[0], np.cumsum(counts)]),
     )
 
 
 def expected_tiles(lists, size_px):
-    """Tiles of each kind: without order, in order, and with a hidden surface."""
+    """Tiles without order, in order, with a hidden surface; bright without order."""
     tiles = [-(-side // TILE_SIZE_PX) for side in size_px]
     columns = -(-tiles[0] // BIN_TILES)
-    kinds = [[], [], []]
+    kinds = [[], [], [], []]
     for bin_index, ordered in enumerate(lists.ordered_tiles):
         for i in range(TILES_PER_BIN):
             x = (bin_index % columns) * BIN_TILES + i % BIN_TILES
             y = (bin_index // columns) * BIN_TILES + i // BIN_TILES
             if x < tiles[0] and y < tiles[1]:
-                hidden = lists.hidden_tiles[bin_index]
-                kind = (ordered >> i & 1) + (ordered & hidden) // 2**i % 2
+                hidden, bright = (
+                    int(bits[bin_index]) >> i & 1
+                    for bits in (lists.hidden_tiles, lists.bright_tiles)
+                )
+                kind = 1 + hidden if int(ordered) >> i & 1 else 3 * bright
                 kinds[kind].append(bin_index * TILES_PER_BIN + i)
     return kinds
 

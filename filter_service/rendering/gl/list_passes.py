@@ -365,7 +365,9 @@ class ListPasses:
         x = bins % self.strip.bin_grid[0] * BIN_TILES + tiles % BIN_TILES
         y = bins // self.strip.bin_grid[0] * BIN_TILES + tiles // BIN_TILES
         ordered, hidden = (counts[:, [word]] >> tiles & 1 for word in (1, 3))
-        kind = np.where((x < columns) & (y < rows), ordered + (ordered & hidden), -1)
+        bright = counts[:, [3]] >> TILES_PER_BIN >> tiles & 1
+        kind = np.where(ordered > 0, 1 + hidden, bright * (TILE_KINDS - 1))
+        kind = np.where((x < columns) & (y < rows), kind, TILE_KINDS)
         of_bin = (kind[..., None] == np.arange(TILE_KINDS)).sum(axis=1)
         return np.concatenate([np.zeros((1, TILE_KINDS), np.int64), of_bin.cumsum(0)])
 
@@ -410,8 +412,10 @@ class ListPasses:
         common = SOFTWARE_SPLAT if software else HARDWARE_SPLAT
         if self.strip.paper_rule:
             return {1: {**common, **self._rule}}
-        ordered = {**common, "IN_ORDER": 1}
-        return {0: common, 1: ordered, 2: {**ordered, "HAS_HIDDEN": 1}}
+        bright = {**common, "HAS_EXCESS": 1}
+        ordered = {**bright, "IN_ORDER": 1}
+        hidden = {**ordered, "HAS_HIDDEN": 1}
+        return {0: common, 1: ordered, 2: hidden, 3: bright}
 
     def counts(self) -> dict[str, int]:
         """Return the counts of `ViewResult` by name."""
