@@ -45,7 +45,7 @@ from tests.benchmarks.truth_points import (
     WINDOW_PX,
     PointTruth,
     camera_at,
-    lateral_colors,
+    lateral_color,
     opened,
     pixel_at,
     point_frames,
@@ -196,20 +196,13 @@ def add_colors(report: Report, truth: PointTruth, engines, eyes) -> None:
     """Add the lateral color of frames."""
     for eye_name in eyes:
         for engine in engines:
-            seen_px, exact_px, mrad_per_px, frame_ms = lateral_colors(
-                COLOR_EYES[eye_name], engine, truth, "quality"
-            )
-            apart_px = seen_px - exact_px
-            apart_mrad = np.linalg.norm(apart_px, axis=2).max(axis=1) * mrad_per_px
-            for unit, error in (
-                ("px", np.abs(apart_px).max()),
-                ("mrad", apart_mrad.max()),
-            ):
+            found = lateral_color(COLOR_EYES[eye_name], engine, truth, "quality")
+            for unit, error in (("px", found.error_px), ("mrad", found.error_mrad)):
                 report.add(
                     *(f"color, {engine}", eye_name, "quality, 3 mm"),
                     *(f"color, largest, {unit}", error),
                     f"{REFERENCE}; goal {COLOR_GOAL:g}",
-                    [frame_ms],
+                    found.frames_ms,
                 )
 
 

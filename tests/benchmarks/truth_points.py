@@ -293,55 +293,71 @@ def point_frames(
     return frames
 
 
-COLOR_PLACES_DEG = tuple(
-    (eccentricity_deg, meridian_deg)
-    for eccentricity_deg in (5.0, 10.0, 15.0, 20.0)
-    for meridian_deg in (0.0, 75.0, 160.0, 255.0)
+COLOR_PLACES_DEG = (
+    *((5.0, 0.0), (5.0, 160.0), (10.0, 75.0), (10.0, 255.0)),
+    *((15.0, 0.0), (15.0, 160.0), (20.0, 75.0), (20.0, 255.0)),
 )
-COLOR_RADIUS_PX = 30
+"""Eccentricities and meridians."""
+
+COLOR_PX, COLOR_RADIUS_PX = (81, 81), 30
 COLOR_STATE = PointState(3.0, 0.5, 0.5)
 
 
-def lateral_colors(profile, engine: str, truth: PointTruth, mode: str):
-    """Return lateral color in a frame, by the frame and by the reference.
+@dataclass(frozen=True)
+class LateralColor:
+    """Lateral color of points, in frames and by the reference.
 
-    Returns
-    -------
+    Attributes
+    ----------
     seen_px, exact_px : (n, 2, 2)
-        Centroids of red and blue minus that of green, x and y, at
-        `COLOR_PLACES_DEG`.
+        Centroids x, y of red and blue minus that of green.
     mrad_per_px : (n,)
         Largest angle of a pixel.
-    frame_ms : float
+    frames_ms : (n,)
     """
-    camera = camera_at(0.0, 0.0, WIDE_PX)
-    pixels = []
+
+    seen_px: NDArray[np.float64]
+    exact_px: NDArray[np.float64]
+    mrad_per_px: NDArray[np.float64]
+    frames_ms: NDArray[np.float64]
+
+    @property
+    def error_px(self) -> float:
+        """Largest difference along x or y."""
+        return float(np.abs(self.seen_px - self.exact_px).max())
+
+    @property
+    def error_mrad(self) -> float:
+        """Largest distance between the centroids."""
+        apart_px = np.linalg.norm(self.seen_px - self.exact_px, axis=2).max(axis=1)
+        return float((apart_px * self.mrad_per_px).max())
+
+
+def lateral_color(profile, engine: str, truth: PointTruth, mode: str) -> LateralColor:
+    """Return the lateral color of points at `COLOR_PLACES_DEG`, in windows."""
+    seen_px, exact_px, mrad_per_px, frames_ms = [], [], [], []
     for eccentricity_deg, meridian_deg in COLOR_PLACES_DEG:
-        away, angle = (
-            math.tan(math.radians(eccentricity_deg)),
-            math.radians(meridian_deg),
-        )
+        away = math.tan(math.radians(eccentricity_deg))
+        angle = math.radians(meridian_deg)
         h_deg, v_deg = pinhole.direction_deg(
             away * math.cos(angle), away * math.sin(angle)
         )
-        pixels.append(pixel_at(camera, float(h_deg), float(v_deg)))
-    with opened(profile, camera, engine, mode=mode, lateral_color=True) as eye_filter:
-        frames = point_frames(
-            *(eye_filter, camera, pixels, COLOR_STATE, truth),
-            reach_px=(COLOR_RADIUS_PX,) * 2,
-            is_gray=True,
-        )
-        largest = [
-            np.linalg.norm(np.linalg.inv(point.pixel_from_mrad), ord=2)
-            for x, y in pixels
-            for point in wavefronts_of(eye_filter, camera, x, y, COLOR_STATE)[:1]
-        ]
-    seen_px, exact_px = (
-        np.stack([f.centroid_px(is_exact, COLOR_RADIUS_PX) for f in frames])
-        for is_exact in (False, True)
-    )
-    return (
-        *(px[:, [0, 2]] - px[:, 1:2] for px in (seen_px, exact_px)),
-        np.array(largest),
-        frames[0].frame_ms,
+        camera = camera_at(float(h_deg), float(v_deg), COLOR_PX)
+        x, y = (n // 2 for n in COLOR_PX)
+        with opened(
+            profile, camera, engine, mode=mode, lateral_color=True
+        ) as eye_filter:
+            (frame,) = point_frames(
+                *(eye_filter, camera, [(x, y)], COLOR_STATE, truth),
+                reach_px=(COLOR_RADIUS_PX, COLOR_RADIUS_PX),
+                is_gray=True,
+            )
+            scale = wavefronts_of(eye_filter, camera, x, y, COLOR_STATE)[0]
+        for apart_px, is_exact in ((seen_px, False), (exact_px, True)):
+            centroids_px = frame.centroid_px(is_exact, COLOR_RADIUS_PX)
+            apart_px.append(centroids_px[[0, 2]] - centroids_px[1])
+        mrad_per_px.append(np.linalg.norm(np.linalg.inv(scale.pixel_from_mrad), ord=2))
+        frames_ms.append(frame.frame_ms)
+    return LateralColor(
+        *(np.array(v) for v in (seen_px, exact_px, mrad_per_px, frames_ms))
     )
