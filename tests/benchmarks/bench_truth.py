@@ -66,7 +66,7 @@ COLOR_EYES = {
     "escudero_sanz": {"kind": "published", "name": "escudero_sanz_navarro_1999"},
     "myopia": "myopia",
 }
-STEP_EYES = ("emmetropia", "keratoconus")
+STEP_EYES = WIDE_EYES = ("emmetropia", "keratoconus")
 REFERENCE = "float64 quadrature"
 GROUNDS = ("black", "gray")
 WIDE_STATE = 1
@@ -104,7 +104,7 @@ class Report:
 def add_points(
     report: Report, truth: PointTruth, engine: str, eye_name: str, n_places: int
 ) -> None:
-    """Add the images and the energies of points in windows and in wide frames.
+    """Add the images and the energies of points in windows.
 
     On the axis, places have the same PSFs: there is one of each state.
     """
@@ -127,6 +127,10 @@ def add_points(
                     own.append((place, state, found[0]))
         for ground, own in frames.items():
             _add_points(report, method, eye_name, f"{ground}, window", goal, own)
+
+
+def add_wide(report: Report, truth: PointTruth, engine: str, eye_name: str) -> None:
+    """Add the images and the energies of points in wide frames."""
     settings, goal = METHODS["quality"]
     camera = camera_at(0.0, 0.0, WIDE_PX)
     places, state = PLACES_DEG[WIDE_STATE :: len(STATES)], STATES[WIDE_STATE]
@@ -281,6 +285,8 @@ def parts(arguments, report: Report) -> dict[str, Callable[[], None]]:
     def points() -> None:
         for eye_name in eyes:
             add_points(report, truth, engine, eye_name, n_places)
+            if eye_name in WIDE_EYES:
+                add_wide(report, truth, engine, eye_name)
 
     return {
         "points": points,
