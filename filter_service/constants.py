@@ -152,10 +152,6 @@ MERGE_MAX_BLUR_RATIO = 0.08
 the fixed step alone, sloping surfaces do not merge at 64 px of blur: 3.7 times as many
 list entries for 65 instead of 62 dB."""
 
-MERGE_FADE_RATIO = 0.1
-"""Squares that are beyond a limit of merging by less than this part of it do not merge,
-but their members are moved toward their mean, the farther the closer to the limit."""
-
 DETECTION_MARGIN_DEG = 5.0
 DETECTION_OCTAVES_PER_DEG = 0.103
 DETECTION_MAX_OCTAVES = 3.0
