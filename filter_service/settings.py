@@ -73,8 +73,9 @@ class RenderOptions(Record):
     merge : bool
         Whether similar pixels share a splat; off is slower.
     render_tolerance : float, 0 to 8
-        Rendering errors relative to the default, which leaves no visible difference; 0
-        is exact, more is faster.
+        Rendering errors relative to the default, which leaves no visible difference;
+        more is faster.  0 is exact: PSFs are computed for the state of the frame, which
+        takes seconds.
     peripheral_merging : bool
         Whether pixels merge more where a viewer detects less contrast, by the angle
         from the frame's gaze; faster.  Frames without a gaze are not affected.

@@ -105,7 +105,9 @@ class BatchOptions:
     ] = "{}"
     render_tolerance: Annotated[
         float,
-        typer.Option(help="Rendering error relative to the default; 0 is exact."),
+        typer.Option(
+            help="Rendering error relative to the default; 0 is exact but slow."
+        ),
     ] = 1.0
     format: Annotated[
         Format,

@@ -140,7 +140,7 @@ def filter_image(
     render_tolerance: Annotated[
         float,
         typer.Option(
-            help="Rendering error relative to the default, 0 to 8; 0 is exact."
+            help="Rendering error relative to the default, 0 to 8; 0 is exact, slow."
         ),
     ] = 1.0,
     engine: Annotated[
