@@ -26,16 +26,8 @@ FRAGMENT = np.dtype(
         ("radius_px", "<u2"),
     ]
 )
-FRAGMENT_LIGHT = np.dtype(
-    [
-        ("rgb", "<f4", 3),
-        ("strength", "<f4"),
-        ("coverage", "<f4"),
-        ("excess", "<f4"),
-        ("depth", "<f4"),
-        ("spare", "<f4"),
-    ]
-)
+FRAGMENT_LIGHT = np.dtype([("rgb", "<f4", 3), ("depth", "<f4")])
+FRAGMENT_EXTRA = np.dtype([("strength", "<f4"), ("coverage", "<f4"), ("excess", "<f4")])
 BLOCK = np.dtype(
     [
         ("first", "<u4"),
@@ -107,6 +99,7 @@ class Frame(c.Structure):
         ("largest_reach_px", c.c_float),
         ("fragments", POINTER),
         ("lights", POINTER),
+        ("extras", POINTER),
         ("blend_shares", POINTER),
         ("boxes", POINTER * 4),
         ("blocks", POINTER),

@@ -190,15 +190,6 @@ INLINE f32x8 twice4(f32x4 value) {
 #endif
 }
 
-/* The first value three times, then the second. */
-INLINE f32x4 first_thrice4(f32x4 value) {
-#if defined(__clang__) || __GNUC__ >= 12
-    return __builtin_shufflevector(value, value, 0, 0, 0, 1);
-#else
-    return __builtin_shuffle(value, (i32x4){0, 0, 0, 1});
-#endif
-}
-
 /* Copies the second of each four lanes to the fourth. */
 INLINE f32x8 second_as_fourth8(f32x8 value) {
     return MIXED(value, value, 0, 1, 2, 1, 4, 5, 6, 5);

@@ -117,9 +117,10 @@ static void add_both(const addition *a, const addition *b) {
 }
 
 /* Prepares the addition of a share of a fragment to a group; false if it lights only other
- * parts of the bin. */
-INLINE int prepare_addition(const frame *f, uint32_t index, float share, depth_group *group,
-                            addition *a) {
+ * parts of the bin.  A plain fragment has no extra values and no share of a cell, and its
+ * raster is clear: many bins have no others, and take a twelfth less time without the checks. */
+INLINE int prepare_addition(const frame *f, uint32_t index, float share, int is_plain,
+                            depth_group *group, addition *a) {
     const fragment *one = f->fragments + index;
     const float *light = (const float *)(f->lights + index);
     const level_image *image = image_of(f, one);
@@ -127,9 +128,18 @@ INLINE int prepare_addition(const frame *f, uint32_t index, float share, depth_g
     reading r = start_reading(one, image, own);
     meeting m = meet(&r, own);
     if (m.pairs <= 0 || m.rows <= 0) return 0;
-    if (f->blend_shares != NULL) share *= f->blend_shares[index];
-    f32x4 scale = all4(image->scale * share);
-    light_raster(own);
+    if (!is_plain && f->blend_shares != NULL) share *= f->blend_shares[index];
+    float scale = image->scale * share;
+    f32x4 colors = load4(light) * (f32x4){scale, scale, scale, 0.0f}; /* without the depth */
+    f32x4 scales = {scale, scale, scale, 0.0f};
+    if (!is_plain && one->state & SPECIAL_BIT) {
+        const fragment_extra *extra = f->extras + index;
+        float coverage = scale * extra->coverage;
+        colors[3] = scale * extra->strength;
+        scales = (f32x4){coverage, coverage, coverage, scale * extra->excess};
+    }
+    if (is_plain) own->is_lit = 1;
+    else light_raster(own);
     a->to = own->pairs + (m.row + r.top) * own->stride + m.pair;
     a->to_stride = own->stride;
     a->rows = m.rows;
@@ -137,8 +147,8 @@ INLINE int prepare_addition(const frame *f, uint32_t index, float share, depth_g
     a->from = row_texels(f, &r, m.row) + 8 * m.pair;
     a->from_stride = 4 * (image->width + 1);
     a->factors = r.factors;
-    a->color = twice4(load4(light) * scale);
-    a->scales = twice4(first_thrice4(load4(light + 4) * scale));
+    a->color = twice4(colors);
+    a->scales = twice4(scales);
     return 1;
 }
 
@@ -153,10 +163,10 @@ INLINE void flush_additions(additions *all) {
     all->waiting = 0;
 }
 
-INLINE void add_fragment(const frame *f, uint32_t index, float share, depth_group *group,
-                         additions *all) {
+INLINE void add_fragment(const frame *f, uint32_t index, float share, int is_plain,
+                         depth_group *group, additions *all) {
     addition *newest = all->two + all->waiting;
-    if (!prepare_addition(f, index, share, group, newest)) return;
+    if (!prepare_addition(f, index, share, is_plain, group, newest)) return;
     if (!all->waiting) {
         all->waiting = 1;
         return;

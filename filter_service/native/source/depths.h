@@ -179,9 +179,9 @@ INLINE void add_behind(const frame *f, uint32_t index, window *w, depth_walk *wa
     int nearer = walk->nearer;
     float next = (place - number - (1.0f - GROUP_BLEND_RATIO)) * (1.0f / GROUP_BLEND_RATIO);
     next = walk->state == SEEN ? larger_float(next, 0.0f) : 0.0f;
-    add_fragment(f, index, 1.0f - next, w->open + nearer, walk->all + nearer);
+    add_fragment(f, index, 1.0f - next, 0, w->open + nearer, walk->all + nearer);
     if (next > 0.0f)
-        add_fragment(f, index, next, w->open + (nearer ^ 1), walk->all + (nearer ^ 1));
+        add_fragment(f, index, next, 0, w->open + (nearer ^ 1), walk->all + (nearer ^ 1));
 }
 
 /* Light of a tile in which order matters: depth by depth. */
@@ -203,6 +203,20 @@ static void splat_in_order(const frame *f, const bin_list *list, uint32_t tile, 
         if (list->entries[i].tiles & tile) cover_with_fragment(f, list->entries[i].fragment, w);
 }
 
+/* Light of plain fragments. */
+static void splat_plain(const frame *f, const bin_list *list, uint32_t tiles, window *w) {
+    additions all = {.waiting = 0};
+    for (int r = 0; r < RESOLUTIONS; ++r) {
+        begin_raster(w->open->sizes + r);
+        w->open->sizes[r].is_lit = 0;
+    }
+    for (int i = 0; i < list->count; ++i)
+        if (list->entries[i].tiles & tiles)
+            add_fragment(f, list->entries[i].fragment, 1.0f, 1, w->open, &all);
+    flush_additions(&all);
+    gather_sizes(w->open);
+}
+
 /* Light of all fragments, or of the visible surface alone, regardless of order. */
 static void splat_unordered(const frame *f, const bin_list *list, uint32_t tiles,
                             int with_hidden, window *w) {
@@ -210,7 +224,7 @@ static void splat_unordered(const frame *f, const bin_list *list, uint32_t tiles
     for (int i = 0; i < list->count; ++i) {
         uint32_t index = list->entries[i].fragment;
         if (!(list->entries[i].tiles & tiles)) continue;
-        if (with_hidden || !is_hidden(f, index)) add_fragment(f, index, 1.0f, w->open, &all);
+        if (with_hidden || !is_hidden(f, index)) add_fragment(f, index, 1.0f, 0, w->open, &all);
     }
     flush_additions(&all);
     light_raster(w->open[0].sizes);

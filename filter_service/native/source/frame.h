@@ -45,25 +45,29 @@ typedef struct { level_image level[MAX_LEVEL + 1]; } kernel_image;
  * (fragment), and the light itself (fragment_light). */
 typedef struct {
     uint16_t x, y;            /* first pixel */
-    uint32_t state;           /* kernel | level << LEVEL_SHIFT | EDGE_BIT */
+    uint32_t state;           /* kernel | level << LEVEL_SHIFT | EDGE_BIT | SPECIAL_BIT */
     uint16_t fraction;        /* of the kernel's interval, in parts of 65535 */
     uint16_t radius_px;
 } fragment;
 
 typedef struct {
     float rgb[RGB];           /* times the coverage */
-    float strength;           /* of an edge of the visible surface, 0 to 1 */
-    float coverage;           /* less than 1 if hidden in part, or one cell's part of a pixel */
-    float excess;             /* light that missing coverage does not amplify */
     float depth;              /* sort depth, smaller is nearer */
-    float spare;              /* the first and the last four are read as vectors */
 } fragment_light;
+
+/* Values of the few fragments with SPECIAL_BIT; of others 0, 1 and 0. */
+typedef struct {
+    float strength;           /* of an edge of the visible surface, 0 to 1 */
+    float coverage;           /* 1 on the visible surface */
+    float excess;             /* light that coverage does not amplify */
+} fragment_extra;
 
 enum { BOX_LEFT, BOX_RIGHT, BOX_TOP, BOX_BOTTOM };
 
 #define LEVEL_SHIFT 28
 #define KERNEL_MASK 0xFFFFFFFu
 #define EDGE_BIT 0x40000000u
+#define SPECIAL_BIT 0x80000000u
 
 /* A block of 8 x 8 pixels; its fragments follow those of the block to its left. */
 typedef struct {
@@ -144,6 +148,7 @@ typedef struct {
     float largest_reach_px;
     fragment *fragments;      /* block_slots per block; no gaps in a row of blocks */
     fragment_light *lights;
+    fragment_extra *extras;
     float *blend_shares;      /* of each fragment; NULL if pixels do not blend cells */
     int16_t *boxes[4];        /* first and last columns and rows that fragments light */
     block_info *blocks;

@@ -26,7 +26,7 @@ typedef struct {
     int capacity;
     int count;
     int x0, y0;               /* first pixel of the bin */
-    int any_edge;
+    int any_edge, any_special;
     uint32_t ordered;         /* tiles where order matters */
 } bin_list;
 
@@ -112,12 +112,13 @@ INLINE void list_some(const frame *f, bin_list *list, uint32_t first, uint32_t e
     }
     list->count = (int)(out - list->entries);
     list->any_edge |= (states & EDGE_BIT) != 0;
+    list->any_special |= (states & SPECIAL_BIT) != 0;
 }
 
 /* Lists the fragments that reach the bin; false if memory ran out. */
 static int list_fragments(const frame *f, bin_list *list) {
     list->count = 0;
-    list->any_edge = 0;
+    list->any_edge = list->any_special = 0;
     int search = f->farthest_px;
     int left = larger_int(list->x0 - search, 0) / TILE_SIZE_PX;
     int top = larger_int(list->y0 - search, 0) / TILE_SIZE_PX;

@@ -68,13 +68,14 @@ INLINE void write_fragment(const block *b, int i, const origin *from, uint32_t a
     float fraction = from->place - (float)position_interval(f, from->place);
     int beyond = level > 1 ? spread_beyond(resolution_of(f, shape, level)) : 0;
     float depth = sort_depth(f, x, y, from->color[3]);
-    uint32_t state = from->kernel | (uint32_t)level << LEVEL_SHIFT
-                     | (from->is_edge ? EDGE_BIT : 0u);
     f32x4 bright = larger4(from->color - b->bright * all4(from->coverage), all4(0.0f));
     float excess = (bright[0] + bright[1] + bright[2]) * (1.0f / RGB);
-    float *light = (float *)(f->lights + at);
-    store4(light, (f32x4){from->color[0], from->color[1], from->color[2], from->strength});
-    store4(light + 4, (f32x4){from->coverage, excess, depth, 0.0f});
+    int is_special = excess > 0.0f || from->strength > 0.0f || from->coverage < 1.0f;
+    uint32_t state = from->kernel | (uint32_t)level << LEVEL_SHIFT
+                     | (from->is_edge ? EDGE_BIT : 0u) | (is_special ? SPECIAL_BIT : 0u);
+    f->lights[at] =
+        (fragment_light){{from->color[0], from->color[1], from->color[2]}, depth};
+    if (is_special) f->extras[at] = (fragment_extra){from->strength, from->coverage, excess};
     f->fragments[at] = (fragment){(uint16_t)x, (uint16_t)y, state,
                                   (uint16_t)(fraction * 65535.0f + 0.5f),
                                   (uint16_t)(shape->radius_px + beyond)};

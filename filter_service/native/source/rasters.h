@@ -52,11 +52,15 @@ INLINE void clear_pairs(pixel_pair *pairs, int stride, int width, int height) {
         memset(pairs + y * stride, 0, sizeof *pairs * (size_t)(width / 2));
 }
 
-/* Clears a raster to which nothing has been added. */
-INLINE void light_raster(raster *own) {
-    if (own->is_lit) return;
+static __attribute__((noinline)) void begin_raster(raster *own) {
     clear_pairs(own->pairs, own->stride, own->width, own->height);
     own->is_lit = 1;
+}
+
+/* Clears a raster to which nothing has been added.  That is rare: inlined, it takes registers
+ * from the loop over fragments. */
+INLINE void light_raster(raster *own) {
+    if (__builtin_expect(!own->is_lit, 0)) begin_raster(own);
 }
 
 /* Sums of a group of depths in all sizes; a tile uses the first elements of each. */

@@ -25,7 +25,9 @@ static void splat_window(const frame *f, const bin_list *list, uint32_t tiles, i
                          int width, int height, bin_sums *s) {
     window w = open_window(x0, y0, width, height, s);
     if (!(list->ordered & tiles)) {
-        splat_unordered(f, list, tiles, 1, &w);
+        if (list->any_special || f->blend_shares != NULL)
+            splat_unordered(f, list, tiles, 1, &w);
+        else splat_plain(f, list, tiles, &w);
         write_window(f, &w, w.open[0].sizes[0].pairs, NULL);
         return;
     }

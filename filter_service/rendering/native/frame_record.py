@@ -21,6 +21,7 @@ from filter_service.native import Loops
 from filter_service.native.records import (
     BLOCK,
     FRAGMENT,
+    FRAGMENT_EXTRA,
     FRAGMENT_LIGHT,
     KERNEL_IMAGE_BYTES,
     KERNEL_SHAPE,
@@ -449,6 +450,7 @@ class FrameRecord:
         n_blocks *= c.surface_count
         c.fragments = self._buffer("fragments", n_blocks * c.block_slots, FRAGMENT)
         c.lights = self._buffer("lights", n_blocks * c.block_slots, FRAGMENT_LIGHT)
+        c.extras = self._buffer("extras", n_blocks * c.block_slots, FRAGMENT_EXTRA)
         if c.blend_column:
             count = n_blocks * c.block_slots
             c.blend_shares = self._buffer("blend_shares", count, np.float32)
