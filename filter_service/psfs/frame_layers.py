@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from estimator.eye.focusing import OUT_OF_REACH_DPT
 from estimator.note import Note
 from estimator.optics.vergence import ObjectVergence
-from filter_service.constants import MERGE_MIN_SPREAD_PX, RGB
+from filter_service.constants import MERGE_MIN_SPREAD_PX
 from filter_service.native import loops
 from filter_service.planning.grid import (
     BASE_OBJECT_STEP_DPT,
@@ -222,7 +222,8 @@ def _step_curve(store: PsfStore, pupil: int, accommodation: int) -> NDArray[np.f
         *(blur_ratio, MIN_BLUR_STEP_PX, LAYER_GAP_STEPS * blur_ratio),
         *(max(spec.blur_px_per_dpt(pupil_mm), 1e-12), BASE_OBJECT_STEP_DPT),
     )
-    first_focus_dpt = in_focus_dpt.reshape(RGB, -1)[GREEN, 0]
+    green_nm = float(spec.channel_wavelengths_nm[GREEN])
+    first_focus_dpt = _foci_dpt(store, green_nm)[0] - axis_zero_dpt[GREEN]
     from_focus = steps[0] - np.interp(first_focus_dpt, at_dpt, steps[0])
     found = np.stack([at_dpt + axis_zero_dpt[GREEN], from_focus])
     store.step_curves[pupil, accommodation] = found
@@ -383,15 +384,19 @@ def _in_focus_dpt(
     store: PsfStore, at_infinity_dpt: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Return the vergences at which some channel is sharp, for all foci of the eye."""
-    if store.eye.rings is None:
-        return -at_infinity_dpt
     channels_nm = store.spec.channel_wavelengths_nm.tolist()
     return np.concatenate(
         [
-            store.eye.rings.main_dpt(nm) - zero_dpt
+            _foci_dpt(store, nm) - zero_dpt
             for nm, zero_dpt in zip(channels_nm, at_infinity_dpt, strict=True)
         ]
     )
+
+
+def _foci_dpt(store: PsfStore, wavelength_nm: float) -> NDArray[np.float64]:
+    """Return the total defocus (n,) of each focus; colors may have several numbers."""
+    rings = store.eye.rings
+    return np.zeros(1) if rings is None else rings.main_dpt(wavelength_nm)
 
 
 def _state_reads(

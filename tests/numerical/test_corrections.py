@@ -21,6 +21,7 @@ from estimator.field.prepare import prepare_eye
 from estimator.optics import prescription as rx
 from estimator.optics.vergence import TYPICAL_ENTRANCE_PUPIL_MM
 from estimator.optics.zernike import EXPONENTS, index_from_nm
+from estimator.profiles.measured_wavefront import MeasuredWavefront
 from estimator.profiles.parse import parse_profile
 from estimator.psf.compute import compute_psf_batch
 from estimator.wavefront.field_wavefronts import (
@@ -30,8 +31,12 @@ from estimator.wavefront.field_wavefronts import (
 )
 from filter_service import Camera, FilterSettings
 from filter_service.planning.grid import GridSpec
+from filter_service.planning.plan import plan_axes
 from filter_service.psfs.eye_for_spec import eye_for_spec
+from filter_service.psfs.frame_layers import frame_layers
+from filter_service.psfs.store import PsfStore
 from filter_service.psfs.store_file import pack, unpack
+from filter_service.view_state import State
 from tests.lens_truth import (
     MM_PER_DEG,
     PUBLISHED,
@@ -406,6 +411,32 @@ def test_the_gaze_of_the_settings_looks_through_its_part_of_a_lens():
         assert not notes
     assert far_dpt[0] == pytest.approx(0.05, abs=0.02)
     assert far_dpt[1] == pytest.approx(2.0, abs=0.08)
+
+
+def test_colors_may_have_different_numbers_of_foci():
+    """The layers of a frame include the vergence of each focus of each color."""
+    body = {
+        "kind": "iol",
+        "design": "trifocal",
+        "adds_dpt": [1.66, 3.33],
+        "steps_waves": [0.35, 0.45],
+    }
+    profile = parse_profile(
+        {"kind": "prescription", "sphere_dpt": 0.0, "correction": body}
+    )
+    eye = MeasuredWavefront.from_profile(profile)
+    spec = GridSpec(
+        Camera.from_fov(20.0, width_px=64, height_px=48),
+        FilterSettings(mode="on-axis", eye_model="wavefront"),
+    )
+    foci_dpt = [eye.rings.main_dpt(nm) for nm in spec.channel_wavelengths_nm.tolist()]
+    assert len({found.size for found in foci_dpt}) > 1
+    store = PsfStore(eye, spec, plan_axes(eye, spec))
+    layers = frame_layers(store, State(3.0, 0.0))
+    for found, zero_dpt in zip(foci_dpt, layers.layer_zero_dpt[0], strict=True):
+        for at_dpt in (found - zero_dpt).tolist():
+            if layers.layer_dpt[0] <= at_dpt <= layers.layer_dpt[-1]:
+                assert np.abs(layers.layer_dpt - at_dpt).min() < 1e-9
 
 
 def test_an_eye_with_rings_is_stored_and_read():
