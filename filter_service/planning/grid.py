@@ -303,6 +303,12 @@ class GridSpec:
         )
 
     @property
+    def psf_accuracy(self) -> str:
+        """Accuracy of wave-optical PSFs, see `estimator.psf.compute_psf_batch`."""
+        is_fine = self.is_exact and self.settings.mode != "dynamic"
+        return "fine" if is_fine else "normal"
+
+    @property
     def blends_at_equal_blur(self) -> bool:
         """Return whether field nodes are blended at equal defocus, not equal distance.
 

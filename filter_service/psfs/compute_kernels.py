@@ -116,7 +116,7 @@ def computed_kernels(
         stiles_crawford=apodization(eye, spec),
         rings=rings,
         rays_from_db=spec.rays_from_db,
-        is_fine=spec.is_exact and spec.settings.mode != "dynamic",
+        accuracy=spec.psf_accuracy,
     )
     if left.size:
         others, more = generic(groups[left], channels[left], total_dpt[left])
@@ -148,6 +148,7 @@ def generic_kernels(
         wavelength_nm=wavefronts.wavelength_nm[channels].ravel(),
         pixel_from_mrad=wavefronts.pixel_from_mrad[each],
         diffraction=spec.settings.diffraction,
+        accuracy=spec.psf_accuracy,
         max_radius_px=spec.max_blur_radius_px,
         min_energy_ratio=1.0 - COMPUTED_BEYOND * (1.0 - spec.kept_energy_ratio),
     )

@@ -101,7 +101,7 @@ class NativePsfs:
         stiles_crawford: StilesCrawford | None = None,
         rings: NodeRings | None = None,
         rays_from_db: float = GEOMETRIC_FROM_DB,
-        is_fine: bool = False,
+        accuracy: str = "normal",
     ) -> tuple[PackedKernels, Counter[str], NDArray[np.int64]]:
         """Compute the kernels of PSFs (n,).
 
@@ -120,8 +120,8 @@ class NativePsfs:
         rings : NodeRings, optional
         rays_from_db : float
             See `GridSpec`.
-        is_fine : bool
-            Whether wave optics has the accuracy "fine" of `compute_psf_batch`.
+        accuracy : "normal" or "fine"
+            Accuracy of wave optics, as of `compute_psf_batch`.
 
         Returns
         -------
@@ -156,7 +156,7 @@ class NativePsfs:
             groups,
             channels,
             rays_from_db=rays_from_db,
-            accuracy=ACCURACY["fine" if is_fine else "normal"],
+            accuracy=ACCURACY[accuracy],
             ring_tables=None if rings is None else rings.amplitude_ratio,
             apodization_center_mm=center_mm,
             ring_steps_per_mm2=TABLE_COUNT / rings.radius_mm**2 if rings else 0.0,

@@ -91,8 +91,8 @@ the cells become twice as wide to save memory.  With 16 bytes per texel, the lim
 150 MB at 1280x720."""
 
 EXACT_CELL_DEG = {"quality": 0.5, "dynamic": 1.0}
-"""The same for frames with a render tolerance of 0, whose pixels blend the kernels of
-cells."""
+"""Largest edge of a cell on the camera's axis for frames with a render tolerance of 0,
+whose pixels blend the kernels of cells."""
 
 EXACT_TEXELS = 48_000_000
 """Largest number of texels of the level-0 kernels of such a frame: 770 MB."""
