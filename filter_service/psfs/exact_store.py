@@ -3,12 +3,15 @@
 Frames with a render tolerance of 0 read no PSFs between nodes of pupil, accommodation
 or defocus: every PSF is computed for the pupil and the focus of the frame, at the total
 defocus of a layer.  What remains is the interpolation between layers and over the
-field.  Nodes of the field are `FIELD_PARTS` times as dense as in the plan of the eye,
-and do not depend on the state, so frames change continuously with it.
+field.  Nodes of the field are those of the plan of the eye and more between them, at
+most `FIELD_STEP_DEG` apart.  They do not depend on the state, so frames change
+continuously with it.
 """
 
 from __future__ import annotations
 
+import itertools
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -27,10 +30,11 @@ from filter_service.psfs.pack import StateReads
 from filter_service.psfs.store import PsfStore
 from filter_service.view_state import State
 
-FIELD_PARTS = {"dynamic": 2, "quality": 3}
-FINE_PARTS = 1
-"""Parts of each interval between the field nodes of an eye's plan, by mode, and added
-parts with tolerance "fine"."""
+FIELD_STEP_DEG = {"dynamic": 0.9, "quality": 0.7}
+FINE_FIELD_RATIO = 0.5
+"""Largest distance between field nodes, by mode, and the factor of "fine".  The error
+grows with its square: in an eye after LASIK, pupil 6 mm, (21, -9) deg, 1.9 % of the
+light is misplaced at 1 degree, 0.8 % at 0.6."""
 
 LAYER_STEP_RATIO = {"on-axis": 0.2, "quality": 0.2, "dynamic": 0.15}
 FINE_STEP_RATIO = 0.5
@@ -57,15 +61,15 @@ class ExactStore(PsfStore):
         Pupil, focus and gaze of the frame; the gaze is within the prepared range.
     object_range_dpt : (low, high)
         Object distances of the frame.
-    fewer_parts : int
-        Number by which the parts of each field interval are reduced, to save memory.
+    field_step_ratio : float
+        Factor of the largest distance between field nodes, to save memory.
 
     Attributes
     ----------
     layers : FrameLayers
         Layers of all frames in this state.
-    field_parts : int
-        Parts of each interval between field nodes of the eye's plan.
+    is_refined : bool
+        Whether there are more field nodes than in the eye's plan.
     """
 
     def __init__(
@@ -74,7 +78,7 @@ class ExactStore(PsfStore):
         state: State,
         object_range_dpt: tuple[float, float],
         *,
-        fewer_parts: int = 0,
+        field_step_ratio: float = 1.0,
     ) -> None:
         settings = base.spec.settings
         is_fine = settings.tolerance == "fine"
@@ -91,16 +95,15 @@ class ExactStore(PsfStore):
         accommodation_dpt = base.eye.accommodation_dpt(
             state.focus_dpt, pupil_diameter_mm=pupil_mm
         )
-        parts = FIELD_PARTS.get(settings.mode, 1)
-        if is_fine and spec.follows_field:
-            parts += FINE_PARTS
-        self.field_parts = max(parts - fewer_parts, 1)
+        step_deg = field_step_ratio * FIELD_STEP_DEG.get(settings.mode, math.inf)
+        step_deg *= FINE_FIELD_RATIO if is_fine else 1.0
         axes = PlanAxes(
-            h_deg=_divided(base.plan.h_deg, self.field_parts),
-            v_deg=_divided(base.plan.v_deg, self.field_parts),
+            h_deg=_divided(base.plan.h_deg, step_deg),
+            v_deg=_divided(base.plan.v_deg, step_deg),
             pupils_mm=np.array([pupil_mm]),
             accommodations_dpt=np.array([accommodation_dpt]),
         )
+        self.is_refined = axes.field_nodes_deg[0].size > base.plan.field_nodes_deg[0].size
         super().__init__(base.eye, spec, axes, engine=base.engine)
         at_infinity_dpt, change = self.defocus.state(
             pupil_diameter_mm=pupil_mm, accommodation_dpt=accommodation_dpt
@@ -169,10 +172,11 @@ class ExactStore(PsfStore):
         )
 
 
-def _divided(axis: NDArray[np.float64], parts: int) -> NDArray[np.float64]:
-    """Return an axis with each interval divided into equal parts."""
-    places = np.arange(parts * (axis.size - 1) + 1) / parts
-    return np.interp(places, np.arange(axis.size), axis)
+def _divided(axis: NDArray[np.float64], step_deg: float) -> NDArray[np.float64]:
+    """Return an axis with each interval in equal parts, of at most a step."""
+    counts = np.maximum(np.ceil(np.diff(axis) / step_deg), 1.0).astype(np.int64)
+    places = [k + np.arange(n) / n for k, n in enumerate(counts)]
+    return np.interp([*itertools.chain(*places), counts.size], range(axis.size), axis)
 
 
 def _covering(

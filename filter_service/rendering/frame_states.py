@@ -201,7 +201,7 @@ class FrameStore:
         self._change: tuple[FrameLayers, ImageCells, NDArray[Any]] | None = None
         self._corner_weights: tuple[FieldAxes, ImageCells, CornerWeights] | None = None
         self._exact: dict[tuple[Any, ...], FrameStore] = {}
-        self._fewer_parts = 0  # of exact stores, which did not fit in memory
+        self._field_step_ratio = 1.0  # of exact stores, more if memory is short
 
     @cached_property
     def node_scale(self) -> NDArray[np.float64]:
@@ -294,7 +294,10 @@ class FrameStore:
                 self._exact.pop(next(iter(self._exact))).release()
             handle = load(
                 ExactStore(
-                    self.store, state, object_range_dpt, fewer_parts=self._fewer_parts
+                    self.store,
+                    state,
+                    object_range_dpt,
+                    field_step_ratio=self._field_step_ratio,
                 )
             )
         self._exact[key] = handle
@@ -306,11 +309,11 @@ class FrameStore:
         Returns whether that was possible.
         """
         if not any(
-            isinstance(handle.store, ExactStore) and handle.store.field_parts > 1
+            isinstance(handle.store, ExactStore) and handle.store.is_refined
             for handle in self._exact.values()
         ):
             return False
-        self._fewer_parts += 1
+        self._field_step_ratio *= 1.5
         self._release_exact()
         return True
 

@@ -329,7 +329,7 @@ static int32_t pack_plane(const psf_job *job, int psf, const pupil *pupils,
         const float *from = kept + row * width;
         uint16_t *to = words + row * width;
         for (int column = 0; column < width; ++column) {
-            float steps = from[column] * per_step + before_cut[row & 3][column & 3];
+            float steps = from[column] * per_step + before_cut[y & 3][(column - left) & 3];
             to[column] = (uint16_t)smaller_float(steps, 65535.0f);
         }
         for (int x = left; x >= 0 && outermost < 0; --x)

@@ -60,9 +60,9 @@ INLINE void write_row(const kernel_end *end, int level, int y, const level_image
     if (from_y < 0 || from_y >= height) return;
     const float *from = end->texels[level] + 4 * (size_t)from_y * (size_t)width;
     to += 4 * (image->left - end->box.left);
-    const float *added = before_cut[y & 3];
+    const float *added = before_next_cut[(y - image->up) & 3];
     for (int x = 0; x < width; ++x) {
-        i32x4 steps = steps_of(load4(from + 4 * x), per_light, added[x & 3]);
+        i32x4 steps = steps_of(load4(from + 4 * x), per_light, added[(x - end->box.left) & 3]);
         i32x4 texel;
         memcpy(&texel, to + 4 * x, sizeof texel);
         texel |= is_far ? steps << 16 : steps;
