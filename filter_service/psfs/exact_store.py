@@ -103,7 +103,8 @@ class ExactStore(PsfStore):
             pupils_mm=np.array([pupil_mm]),
             accommodations_dpt=np.array([accommodation_dpt]),
         )
-        self.is_refined = axes.field_nodes_deg[0].size > base.plan.field_nodes_deg[0].size
+        sizes = [plan.h_deg.size * plan.v_deg.size for plan in (axes, base.plan)]
+        self.is_refined = sizes[0] > sizes[1]
         super().__init__(base.eye, spec, axes, engine=base.engine)
         at_infinity_dpt, change = self.defocus.state(
             pupil_diameter_mm=pupil_mm, accommodation_dpt=accommodation_dpt
