@@ -27,6 +27,8 @@ from estimator.optics.zernike import (
 )
 from estimator.periphery.population import (
     CIRCLE_MM,
+    FREEDOM,
+    LARGEST_SIZE,
     TERMS,
     Population,
     field_matrix,
@@ -64,12 +66,6 @@ OFF_MERIDIAN_AT_DEG, CORRELATION_LENGTH_DEG = 25.0, 20.0
 
 FIELD_STREAM = 1
 """Second seed of drawn changes; the axis has another (`typical_aberrations`)."""
-
-FREEDOM = 5
-"""Degrees of freedom of the multivariate t-distribution of drawn deviations from the
-most probable change.  Measured deviations are heavy-tailed: the excess kurtosis of M is
-7 to 3 between 20 deg nasal and 10 deg temporal.  With a normal distribution, the MTF of
-drawn peripheries at 10 deg is 0.045 below the MTF of the same people."""
 
 N_FEATURES = 256
 """Number of cosines of a drawn Gaussian process."""
@@ -281,7 +277,7 @@ def _conditioned(
 
     A change is drawn by Matheron's rule: an eye drawn from the population is corrected
     by the difference of its simulated measurements from the actual ones.  One size for
-    all of its deviations makes the distribution a t-distribution.
+    all of its deviations makes the distribution a t-distribution; see `LARGEST_SIZE`.
     """
     axis_um, axis_noise_um = axis
     mean_um = population.mean_um
@@ -313,7 +309,7 @@ def _conditioned(
         random = np.random.RandomState([sample, FIELD_STREAM])
         jitter = np.diag(RELATIVE_JITTER * scale**2)
         root = np.linalg.cholesky(covariance + jitter)
-        size = math.sqrt((FREEDOM - 2) / random.chisquare(FREEDOM))
+        size = min(math.sqrt((FREEDOM - 2) / random.chisquare(FREEDOM)), LARGEST_SIZE)
         prior_um = prior_um + size * (root @ random.standard_normal(scale.size))
         draw = OffMeridianDraw.draw(random, size)
         noise_um = np.sqrt(noise_um2) * random.standard_normal(noise_um2.size)
@@ -336,6 +332,11 @@ def _conditioned(
         sample=sample,
         off_meridian_draw=draw,
     )
+
+
+def drawn_size(random: np.random.RandomState) -> float:
+    """Return the factor of all deviations of a drawn person, at most `LARGEST_SIZE`."""
+    return min(math.sqrt((FREEDOM - 2) / random.chisquare(FREEDOM)), LARGEST_SIZE)
 
 
 def _sphere_deviation_dpt(variances_um2: NDArray[Any]) -> NDArray[np.float64]:

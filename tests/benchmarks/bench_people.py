@@ -15,7 +15,9 @@ and averaged, with its deviation between draws.
 A second table compares the typical eye of a prescription of 0 dpt, and N persons drawn
 with this prescription, with published measurements of people.  `people_optics` and
 `people_vision` define the measures, `tests/human_data.py` contains the sources.  The
-modulation of a group is the mean over its eyes, not that of the mean wavefront.
+modulation of a group is the mean over its eyes, not that of the mean wavefront.  Then
+`people_spread` compares spread, couplings and extremes of drawn persons with those of
+people left out of the population.
 Columns: value of the modeled eyes, published value, difference, change by residual
 refraction, change by scattered light (double pass only), remaining difference, and the
 range of 80 % of the modeled eyes.
@@ -61,6 +63,8 @@ from tests.benchmarks.people_optics import (
     refraction_findings,
 )
 from tests.benchmarks.people_picture import plot_fields, show_scene
+from tests.benchmarks.people_spread import DRAWS as SPREAD_DRAWS
+from tests.benchmarks.people_spread import PERSONS, spread_findings
 from tests.benchmarks.people_vision import (
     PUPILS_MM,
     acuity_findings,
@@ -96,6 +100,7 @@ FIELDS, QUICK_FIELDS = 10, 2
 """Peripheries drawn for each measured axis."""
 
 FIELD_ANGLES_DEG = (-20.0, -10.0, -5.0, 5.0, 10.0, 20.0)
+QUICK_SPREAD_DRAWS, QUICK_PERSONS = 10, 100
 QUICK_STEP = 6
 """With ``--quick``, every sixth measured eye is used."""
 
@@ -410,16 +415,20 @@ def found_beside_people(
     step = QUICK_STEP if quick else 1
     readers = QUICK_ACUITY_PEOPLE if quick else ACUITY_PEOPLE
     fields = QUICK_FIELDS if quick else FIELDS
+    fold_count = QUICK_FOLDS if quick else FOLDS
     sections = {
         "modulation": lambda: modulation_findings(
             seeds, people.select(_every(step, people)), curves
         ),
         "same people": lambda: field_findings(
+            people, fold_count, fields if seeds else 0, step, curves
+        ),
+        "spread": lambda: spread_findings(
             people,
-            QUICK_FOLDS if quick else FOLDS,
-            fields if seeds else 0,
-            step,
-            curves,
+            folds(people, fold_count),
+            profile_of,
+            draws=QUICK_SPREAD_DRAWS if quick else SPREAD_DRAWS,
+            persons=QUICK_PERSONS if quick else PERSONS,
         ),
         "higher orders": lambda: higher_order_findings(seeds, people),
         "near periphery": lambda: near_findings(seeds),

@@ -35,6 +35,8 @@ class Finding:
         none.
     band : (float, float)
         `BAND` of the modeled eyes; NaN for a single eye.
+    interval : (float, float)
+        95 % interval of a sample of people; NaN if there is none.
     """
 
     measure: str
@@ -49,11 +51,18 @@ class Finding:
     with_residual: float = math.nan
     with_halo: float = math.nan
     band: tuple[float, float] = (math.nan, math.nan)
+    interval: tuple[float, float] = (math.nan, math.nan)
 
     @property
     def difference(self) -> float:
         """Return the value of modeled eyes minus the published one."""
         return self.ours - self.theirs
+
+    @property
+    def is_inside(self) -> bool:
+        """Whether the value of modeled eyes is within the interval."""
+        low, high = self.interval
+        return low <= self.ours <= high
 
     def rows(self) -> Iterator[Row]:
         """Yield a row of the value, and rows with the effects of the instrument."""
@@ -62,11 +71,13 @@ class Finding:
             ", residual refraction": self.with_residual,
             ", residual refraction and halo": self.with_halo,
         }
+        low, high = self.interval
+        limits = f" ({low:.3f} to {high:.3f})" if math.isfinite(low) else ""
         for suffix, value in values.items():
             if math.isfinite(value):
                 yield Row(
                     *("people", self.measure, self.eyes),
-                    f"{self.setting}{suffix}: {value:.3f}",
+                    f"{self.setting}{suffix}: {value:.3f}{limits}",
                     *(self.count, self.time_ms, self.time_ms, memory_mb()),
                     *(self.unit, value - self.theirs, self.source),
                 )
@@ -84,7 +95,7 @@ def print_findings(findings: Iterable[Finding]) -> None:
     """Print modeled and published values, and the effects of the instrument."""
     print(
         f"\n{'measure':<25}{'eyes':<25}{'setting':<32}{'ours':>8}{'theirs':>8}"
-        f"{'diff':>8}{'residu':>8}{'halo':>8}{'left':>8}  {'10 to 90 %':<16}source"
+        f"{'diff':>8}{'residu':>8}{'halo':>8}{'left':>8}  {'range':<16}source"
     )
     for found in findings:
         left = (
@@ -96,7 +107,7 @@ def print_findings(findings: Iterable[Finding]) -> None:
             left - found.theirs,
         )
         texts = [f"{c:8.3f}" if math.isfinite(c) else f"{'-':>8}" for c in cells]
-        low, high = found.band
+        low, high = found.band if math.isnan(found.interval[0]) else found.interval
         band = f"{low:.3f} {high:.3f}" if math.isfinite(low) else "-"
         print(
             f"{found.measure:<25}{found.eyes:<25}{found.setting:<32}"
