@@ -53,9 +53,50 @@ Whatham et al. (J Vis 9(3):14) and Lundstrom et al. (J Vis 9(6):17) found 0.1 to
 more myopia over several dpt; -0.3 over 4 dpt is the middle of that."""
 
 MATHUR_FOCUS_DPT, MATHUR_PUPIL_MM, MATHUR_C40_UM = (0.3, 4.0), 5.0, -0.10
-"""Change of C(4,0) in all of 38 directions within 21 deg: 9 emmetropes (Mathur,
-Atchison & Charman, J Vis 9(12):20, 2009).  Relative refraction, astigmatism and other
-higher orders hardly changed."""
+"""Change of C(4,0) in all of 38 directions within 21 deg: 9 young adult emmetropes
+(Mathur, Atchison & Charman, J Vis 9(12):20, 2009).  Relative refraction, astigmatism
+and other higher orders hardly changed."""
+
+LOPEZ_GIL_RATIO = 1.0 / 7.0
+"""Accommodation response, dpt, that the change of spherical aberration takes from each
+dpt of stimulus, if the eye minimizes the RMS: 15 eyes with natural pupils
+(López-Gil & Fernández-Sánchez, J Vis 10(13):12, 2010).
+
+Studies that agree in the sign, without a slope in their abstracts:
+
+- He, Burns & Marcos, Vision Res 40:41, 2000 (8 eyes, 0 to 6 dpt): C(4,0) falls in every
+  eye, but does not become negative in every eye.
+- Cheng et al., J Vis 4(4):3, 2004 (76 eyes).
+- Plainis, Ginis & Pallikaris, J Vis 5(5):7, 2005 (7 eyes, up to 8 dpt).
+- Radhakrishnan & Charman, J Vis 7(7):11, 2007 (47 eyes, 17 to 56 years, 0 to 4 dpt):
+  C(4,0) falls and becomes negative below 40 years.
+- Zhou et al., Eye 29:115, 2015 (22 eyes, 18 to 28 years, 0 to 6 dpt): C(4,0) falls at
+  responses of 0.85, 1.63, 2.38, 3.25, 4.18 and 5.09 dpt.
+
+Atchison et al., Vision Res 35:313, 1995, found a fall in 8 of 15 eyes up to 3 dpt."""
+
+
+def mathur_slope_um(pupil_diameter_mm: ArrayLike) -> NDArray[np.float64]:
+    """Return the change of C(4,0) (...), um for each dpt, scaled to other pupils."""
+    far_dpt, near_dpt = MATHUR_FOCUS_DPT
+    ratio = np.asarray(pupil_diameter_mm, dtype=np.float64) / MATHUR_PUPIL_MM
+    slope_um: NDArray[np.float64] = MATHUR_C40_UM / (near_dpt - far_dpt) * ratio**4
+    return slope_um
+
+
+def taken_ratio(
+    slope_um: ArrayLike, pupil_diameter_mm: ArrayLike
+) -> NDArray[np.float64]:
+    """Return what `LOPEZ_GIL_RATIO` is for a slope (...) of C(4,0), um for each dpt.
+
+    The refraction with the smallest RMS and that of the center differ by
+    12 sqrt(5) C(4,0) / r².
+    """
+    radius_mm = 0.5 * np.asarray(pupil_diameter_mm, dtype=np.float64)
+    ratio: NDArray[np.float64] = (
+        -12.0 * np.sqrt(5.0) * np.asarray(slope_um) / radius_mm**2
+    )
+    return ratio
 
 
 def navarro_modulation(

@@ -39,6 +39,8 @@ NEAR_FOCI_DPT, NEAR_PUPILS_MM, NEAR_ANGLE_DEG = (
 )
 SPHERES_DPT = (0.0, -2.0, -4.0, -6.0)
 MATHUR_ANGLE_DEG = 20.0
+SPHERICAL_FOCI_DPT = (0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0)
+SPHERICAL_PUPILS_MM = (5.0, 6.0)
 LARGEST_PUPIL_MM = 6.0
 
 
@@ -323,6 +325,7 @@ def near_findings(seeds: Sequence[int]) -> Iterator[Finding]:
                 changes = relative[focus] - far
                 yield from _near_rows(eyes, pupil_mm, focus, changes)
         yield from _mathur(eyes, profiles)
+        yield from _spherical_rows(eyes, profiles)
 
 
 def _relative(
@@ -388,6 +391,42 @@ def _mathur(eyes: str, profiles: Sequence[EyeProfile]) -> Iterator[Finding]:
             *(float(values_um.mean()), human_data.MATHUR_C40_UM, "um", "Mathur 2009"),
             count=len(profiles),
             band=band_of(values_um),
+        )
+
+
+def _spherical_rows(eyes: str, profiles: Sequence[EyeProfile]) -> Iterator[Finding]:
+    """Yield the change of C(4,0) on the axis from the relaxed eye, by focus."""
+    c40, far = index_from_nm(4, 0), SPHERICAL_FOCI_DPT[0]
+    for pupil_mm in SPHERICAL_PUPILS_MM:
+        at_um = np.array(
+            [
+                [
+                    on_circle_um(p, [0.0], pupil_diameter_mm=pupil_mm, focus_dpt=focus)
+                    for focus in SPHERICAL_FOCI_DPT
+                ]
+                for p in profiles
+            ]
+        )[:, :, 0, c40]
+        change_um = at_um - at_um[:, :1]
+        slope_um = float(human_data.mathur_slope_um(pupil_mm))
+        for k, focus in enumerate(SPHERICAL_FOCI_DPT[1:], start=1):
+            yield Finding(
+                *("accommodation, C40", eyes),
+                f"{far:g} to {focus:g} dpt, {pupil_mm:g} mm",
+                *(float(change_um[:, k].mean()), slope_um * (focus - far), "um"),
+                "Mathur 2009, scaled by r^4",
+                count=len(profiles),
+                band=band_of(change_um[:, k]),
+            )
+        taken = human_data.taken_ratio(
+            change_um[:, -1] / (SPHERICAL_FOCI_DPT[-1] - far), pupil_mm
+        )
+        yield Finding(
+            *("accommodation, response taken", eyes, f"0 to 6 dpt, {pupil_mm:g} mm"),
+            *(float(taken.mean()), human_data.LOPEZ_GIL_RATIO, "ratio"),
+            "López-Gil & Fernández-Sánchez 2010, natural pupils",
+            count=len(profiles),
+            band=band_of(taken),
         )
 
 

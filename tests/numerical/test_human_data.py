@@ -53,6 +53,20 @@ def test_williams_modulation(cpd, expected):
     )
 
 
+@pytest.mark.parametrize(("pupil_mm", "expected"), [(5.0, -0.02703), (6.0, -0.05604)])
+def test_mathur_slope(pupil_mm, expected):
+    slope_um = human_data.mathur_slope_um(pupil_mm)
+    assert float(slope_um) == pytest.approx(expected, abs=1e-5)
+
+
+def test_response_that_spherical_aberration_takes():
+    """A paraxial focus that differs from the least-squares one by 1/7 dpt."""
+    slope_um = -human_data.LOPEZ_GIL_RATIO * 2.5**2 / (12.0 * math.sqrt(5.0))
+    assert slope_um == pytest.approx(-0.03327, abs=1e-5)
+    taken = human_data.taken_ratio(slope_um, 5.0)
+    assert float(taken) == pytest.approx(1.0 / 7.0)
+
+
 def test_watson_modulation():
     found = float(mean_eye_transfer(12.0, pupil_diameter_mm=3.0))
     assert found == pytest.approx(0.4836, abs=1e-4)
