@@ -14,7 +14,7 @@ from estimator.eye.assembly import (
     DIAMETER,
     SMALLEST_AQUEOUS_MM,
     SMALLEST_DIAMETER_RATIO,
-    accommodated_eyes,
+    resized_eyes,
     smallest_diameter_mm,
 )
 from estimator.eye.parameters import allowed_ranges
@@ -50,12 +50,13 @@ def partly_accommodated_eyes(
     """Return eyes (n, 45), half of them accommodated.
 
     ``used_unit`` (n,) is in 0..1: up to `RELAXED_RATIO`, eyes are relaxed; above, the
-    lens diameter is uniform over its range.
+    lens diameter is uniform over its range.  The conic constants, which are inputs of
+    the networks, are those of the relaxed eyes.
     """
     used = np.maximum(used_unit - RELAXED_RATIO, 0.0) / (1.0 - RELAXED_RATIO)
     relaxed_mm = eyes[:, DIAMETER]
     shrunk_mm = used * (smallest_diameter_mm(eyes) - relaxed_mm)
-    return accommodated_eyes(eyes, relaxed_mm + shrunk_mm)
+    return resized_eyes(eyes, relaxed_mm + shrunk_mm)
 
 
 def population_ranges(*, is_focused: bool) -> NDArray[np.float64]:

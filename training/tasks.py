@@ -16,8 +16,8 @@ from estimator.eye.accommodation import AccommodatingEye
 from estimator.eye.assembly import (
     AQUEOUS,
     DIAMETER,
-    accommodated_eyes,
     pack_eyes,
+    resized_eyes,
     smallest_diameter_mm,
 )
 from estimator.eye.parameters import PARAMETER_NAMES, EyeParameters, sampled_ranges
@@ -174,6 +174,7 @@ def _focus_of_one(
         eye = AccommodatingEye(
             EyeParameters.from_vector(eye_and_pupil[:N_EYE]),
             pupil_diameter_mm=float(eye_and_pupil[N_EYE]),
+            keeps_conics=True,
         )
     except TraceFailed:
         return np.full((len(focuses_dpt), 2), np.nan)
@@ -192,7 +193,7 @@ def label_lens(inputs: NDArray[np.float64]) -> NDArray[np.float64]:
     widest_mm, least_mm = LENS_DIAMETER_MARGINS * np.stack(
         [relaxed_mm, smallest_diameter_mm(eyes)]
     )
-    focused = accommodated_eyes(eyes, widest_mm + share * (least_mm - widest_mm))
+    focused = resized_eyes(eyes, widest_mm + share * (least_mm - widest_mm))
     color_nm = np.full(len(eyes), REFERENCE_WAVELENGTH_NM)
     zernike_um = _whole_circles(focused, pupil_mm, color_nm)
     focus_dpt = SPHERE_PER_C20 * zernike_um[:, C20] / (pupil_mm / 2.0) ** 2

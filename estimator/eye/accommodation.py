@@ -325,6 +325,8 @@ class AccommodatingEye(TabulatedFocusing[FocusedEye]):
     ----------
     rest : Rest, optional
         Phase added to the traced eye.
+    keeps_conics : bool
+        Whether the lens keeps its conic constants, as it does for the focus network.
     """
 
     def __init__(
@@ -336,8 +338,10 @@ class AccommodatingEye(TabulatedFocusing[FocusedEye]):
         amplitude_dpt: float = math.inf,
         correction: rx.Prescription | None = None,
         rest: ResidualPhase | None = None,
+        keeps_conics: bool = False,
     ):
         self.parameters = parameters
+        self._keeps_conics = keeps_conics
         self.retina = retina
         self.pupil_diameter_mm = pupil_diameter_mm
         self._vector = parameters.to_vector()
@@ -356,6 +360,14 @@ class AccommodatingEye(TabulatedFocusing[FocusedEye]):
             rest_dpt=float(self._rest_dpt(pupil_diameter_mm)[0]),
         )
         self.lens_range_dpt = float(self._accommodations_dpt[-1])
+
+    def _vectors(self, diameters_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the eye (P, 45) with lens diameters (P,)."""
+        return accommodated_vectors(
+            self._vector,
+            lens_diameter_mm=diameters_mm,
+            keeps_conics=self._keeps_conics,
+        )
 
     def _rest_dpt(self, pupil_diameter_mm: ArrayLike) -> NDArray[np.float64]:
         """Return M (n,) of the residual on round pupils (n,)."""
@@ -387,7 +399,7 @@ class AccommodatingEye(TabulatedFocusing[FocusedEye]):
         """
         pupils_mm = np.array(table_pupils_mm(self.pupil_diameter_mm))
         some = np.unique(np.linspace(0, self._nodes.size - 1, N_FOCUS).astype(int))
-        states = accommodated_vectors(self._vector, lens_diameter_mm=self._nodes[some])
+        states = self._vectors(self._nodes[some])
         rest_um = np.zeros((pupils_mm.size, N_TERMS))
         if self._rest is not None:
             rest_um = self._rest.on_axis_um(pupils_mm)
@@ -409,7 +421,7 @@ class AccommodatingEye(TabulatedFocusing[FocusedEye]):
         it.
         """
         refractions_dpt = refraction_of_vectors(
-            accommodated_vectors(self._vector, lens_diameter_mm=self._nodes),
+            self._vectors(self._nodes),
             retina=self.retina,
             pupil_diameter_mm=self.pupil_diameter_mm,
         )
@@ -446,7 +458,7 @@ class AccommodatingEye(TabulatedFocusing[FocusedEye]):
 
     def _refractions_dpt(self, nodes: NDArray[np.float64]) -> NDArray[np.float64]:
         return refraction_of_vectors(
-            accommodated_vectors(self._vector, lens_diameter_mm=nodes),
+            self._vectors(nodes),
             retina=self.retina,
             pupil_diameter_mm=self.pupil_diameter_mm,
             wavelength_nm=REFERENCE_WAVELENGTH_NM,
@@ -459,9 +471,7 @@ class AccommodatingEye(TabulatedFocusing[FocusedEye]):
 
     def changes_mm(self, accommodations_dpt: ArrayLike) -> NDArray[np.float64]:
         """Return changes (P, 2) of lens diameter and aqueous thickness."""
-        vectors = accommodated_vectors(
-            self._vector, lens_diameter_mm=self.lens_diameters_mm(accommodations_dpt)
-        )
+        vectors = self._vectors(self.lens_diameters_mm(accommodations_dpt))
         return (vectors - self._vector)[:, [DIAMETER, AQUEOUS]]
 
     def states_at(self, accommodations_dpt: ArrayLike) -> list[FocusedEye]:
@@ -481,7 +491,9 @@ class AccommodatingEye(TabulatedFocusing[FocusedEye]):
 
     def _state(self, accommodation_dpt: float, diameter_mm: float) -> FocusedEye:
         relaxed = self.parameters
-        eye = accommodated(relaxed, lens_diameter_mm=diameter_mm)
+        eye = accommodated(
+            relaxed, lens_diameter_mm=diameter_mm, keeps_conics=self._keeps_conics
+        )
         return FocusedEye(
             parameters=eye,
             surfaces=eye_surfaces(eye, retina=self.retina),

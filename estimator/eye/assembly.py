@@ -7,6 +7,14 @@ and C, assign part of the volume to the caps and a thickness to the rim.
 The accommodating lens shrinks at constant volume, which steepens both surfaces (rule
 C).  The part before the equator gets thicker, which moves the anterior pole and the
 stop forward and makes the aqueous thinner.  The eye length does not change.
+
+The anterior surface takes part in this deformation: scaled by s across the axis and by
+1/s² along it, a conic remains a conic, with 1 + k scaled by s⁶.  The posterior surface
+keeps its conic constant.  In stretched lenses of monkeys, too, the anterior conic
+constant became less negative with accommodation and the posterior one did not change
+(de Castro et al., Invest Ophthalmol Vis Sci 54:6197, 2013).  Lenses with a gradient
+index have been fitted with the opposite change (-1/2 per diopter: Navarro, J Vis
+14(7):21, 2014); in this homogeneous one it would double the fall of C(4,0).
 """
 
 import math
@@ -430,21 +438,59 @@ SMALLEST_AQUEOUS_MM = 1.0
 DIAMETER = column("lens_diameter_mm")
 VOLUME = column("lens_volume_mm3")
 AQUEOUS = column("aqueous_thickness_mm")
+ANTERIOR_CONIC = column("lens_anterior_conic_constant")
 
 
 def accommodated_vectors(
-    vector: NDArray[np.float64], *, lens_diameter_mm: ArrayLike
+    vector: NDArray[np.float64],
+    *,
+    lens_diameter_mm: ArrayLike,
+    keeps_conics: bool = False,
 ) -> NDArray[np.float64]:
-    """Return vectors (P, 45) of one relaxed eye with lens diameters (P,)."""
+    """Return vectors (P, 45) of one relaxed eye with lens diameters (P,).
+
+    With ``keeps_conics`` they are those of `resized_eyes`.
+    """
     lens_diameter_mm = np.atleast_1d(np.asarray(lens_diameter_mm, dtype=np.float64))
     vectors = np.repeat(vector[None], lens_diameter_mm.size, axis=0)
-    return accommodated_eyes(vectors, lens_diameter_mm)
+    change = resized_eyes if keeps_conics else accommodated_eyes
+    return change(vectors, lens_diameter_mm)
 
 
 def accommodated_eyes(
     vectors: NDArray[np.float64], lens_diameter_mm: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return eyes (P, 45) with other lens diameters (P,) at constant volume."""
+    """Return relaxed eyes (P, 45) accommodated to lens diameters (P,)."""
+    focused = resized_eyes(vectors, lens_diameter_mm)
+    focused[:, ANTERIOR_CONIC] = accommodated_conic_constant(
+        vectors[:, ANTERIOR_CONIC],
+        diameter_ratio=lens_diameter_mm / vectors[:, DIAMETER],
+    )
+    return focused
+
+
+def accommodated_conic_constant(
+    conic_constant: NDArray[np.float64], *, diameter_ratio: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return anterior conic constants (...) of lenses with smaller diameters.
+
+    Parameters
+    ----------
+    conic_constant : (...)
+        Of the relaxed lens.
+    diameter_ratio : (...)
+        Diameter over that of the relaxed lens; 1 returns the same bits.
+    """
+    return conic_constant + (1.0 + conic_constant) * (diameter_ratio**6 - 1.0)
+
+
+def resized_eyes(
+    vectors: NDArray[np.float64], lens_diameter_mm: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return eyes (P, 45) with other lens diameters (P,) at constant volume.
+
+    The conic constants do not change: the focus network was trained on such eyes.
+    """
     volume_mm3 = vectors[:, VOLUME]
     relaxed = lens_shape(diameter_mm=vectors[:, DIAMETER], volume_mm3=volume_mm3)
     shape = lens_shape(diameter_mm=lens_diameter_mm, volume_mm3=volume_mm3)
@@ -455,9 +501,11 @@ def accommodated_eyes(
 
 
 def accommodated(
-    parameters: EyeParameters, *, lens_diameter_mm: float
+    parameters: EyeParameters, *, lens_diameter_mm: float, keeps_conics: bool = False
 ) -> EyeParameters:
-    """Return the same eye with another lens diameter at constant volume.
+    """Return the same eye, accommodated to a lens diameter.
+
+    With ``keeps_conics`` it is that of `resized_eyes`.
 
     Raises
     ------
@@ -465,12 +513,15 @@ def accommodated(
         The diameter is not positive.
     """
     vectors = accommodated_vectors(
-        parameters.to_vector(), lens_diameter_mm=lens_diameter_mm
+        parameters.to_vector(),
+        lens_diameter_mm=lens_diameter_mm,
+        keeps_conics=keeps_conics,
     )
     return replace(
         parameters,
         lens_diameter_mm=float(vectors[0, DIAMETER]),
         aqueous_thickness_mm=float(vectors[0, AQUEOUS]),
+        lens_anterior_conic_constant=float(vectors[0, ANTERIOR_CONIC]),
     )
 
 

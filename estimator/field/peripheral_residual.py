@@ -14,15 +14,17 @@ The population was measured through `CIRCLE_MM`.  Wider pupils have the same pol
 one that grows more slowly beyond 6 mm gives M a kink of 0.1 to 0.5 dpt/mm there, and
 makes the far periphery of a myope up to 1 dpt more myopic at 7 mm than at 6 mm.
 
-The refraction of the periphery is held at every accommodation, relative to the axis: in
-people, refraction off the axis relative to that on the axis hardly changes with
-accommodation: no significant change in Calver et al. 2007 (Vision Res 47:2341) and
-Davies & Mallen 2009 (Br J Ophthalmol 93:1225), 0.1 to 0.5 dpt more myopic over several
-diopters in Whatham et al. 2009 (J Vis 9(3):14) and Lundstrom et al. 2009 (J Vis
-9(6):17).  The eye model, with its homogeneous lens and fixed retina, turns 0.28 dpt
-more hyperopic at 30 deg for each diopter.  A phase removes that: through `CIRCLE_MM`,
-at the cornea, M, J0 and J45 relative to the axis match the relaxed eye.  Higher orders
-change as traced.
+The periphery's wavefront relative to the axis is held at every accommodation, in all
+terms of the population.  In people, refraction off the axis relative to that on the
+axis hardly changes with accommodation: no significant change in Calver et al. 2007
+(Vision Res 47:2341) and Davies & Mallen 2009 (Br J Ophthalmol 93:1225), 0.1 to 0.5 dpt
+more myopic over several diopters in Whatham et al. 2009 (J Vis 9(3):14) and Lundstrom
+et al. 2009 (J Vis 9(6):17).  Higher orders hardly change either, but for C(4,0), which
+falls as much in all directions within 21 deg (Mathur et al. 2009, J Vis 9(12):20).  The
+eye model, with its homogeneous lens and fixed retina, turns 0.28 dpt more hyperopic at
+30 deg for each diopter, and at 20 deg C(4,0) falls a fifth as much as on the axis.  A
+phase removes that: through `CIRCLE_MM`, at the cornea, the wavefront less that on the
+axis is the relaxed eye's, but for tilt.
 """
 
 from dataclasses import replace
@@ -42,7 +44,6 @@ from estimator.field.interpolation import (
     FieldNodes,
     aberration_grid,
 )
-from estimator.optics.prescription import C2M2, C20, C22
 from estimator.optics.units import REFERENCE_WAVELENGTH_NM
 from estimator.optics.zernike import (
     N_TERMS,
@@ -180,14 +181,14 @@ def _on_circle(eye: EstimatedEye) -> NDArray[np.float64]:
     )
 
 
-SECOND_ORDER = [C2M2, C20, C22]
+HELD = list(TERMS)
 
 ITERATIONS = 3
 """Corrections of the phase; the transfer to the cornea is slightly nonlinear.  After
 the third, the refraction is held to 1e-6 dpt."""
 
 
-def held_refraction_um(
+def held_periphery_um(
     eye: EyeModel, grid: AberrationGrid, periphery: PeripheralResidual
 ) -> NDArray[np.float64]:
     """Return the phase at the nodes of a grid, in the plane of the entrance pupil.
@@ -203,7 +204,7 @@ def held_refraction_um(
     Returns
     -------
     (n_h, n_v, n_accommodations, 28), um/mm^degree
-        Second-degree monomials; NaN where the eye could not be traced.
+        Monomials of degrees 2 to 4; NaN where the eye could not be traced.
     """
     h_deg, v_deg = np.meshgrid(grid.h_deg, grid.v_deg, indexing="ij")
     shape = *h_deg.shape, 1 + grid.accommodations_dpt.size
@@ -223,17 +224,17 @@ def held_refraction_um(
         moved_um = moved_polynomial(
             polynomial_um, depth_mm=-depth_mm, radius_mm=CIRCLE_MM
         )
-        return zernike_from_polynomial(moved_um, CIRCLE_MM)[..., SECOND_ORDER]
+        return zernike_from_polynomial(moved_um, CIRCLE_MM)[..., HELD]
 
     on_axis_um = at_cornea_um(traced_um[-1])
     wanted_um = at_cornea_um(field_um[:, :, :1]) + on_axis_um - on_axis_um[0]
     phase_um = np.zeros((*shape, N_TERMS))
     for _ in range(ITERATIONS):
         missing_um = np.zeros_like(phase_um)
-        missing_um[..., SECOND_ORDER] = wanted_um - at_cornea_um(
+        missing_um[..., HELD] = wanted_um - at_cornea_um(
             summed_terms(field_um, phase_um)
         )
-        step_um = polynomial_in_mm(missing_um, CIRCLE_MM)
+        step_um = polynomial_in_mm(remove_central_tilt(missing_um), CIRCLE_MM)
         step_um[..., 0] = 0.0  # piston
         phase_um += step_um
     return phase_um[:, :, 1:]

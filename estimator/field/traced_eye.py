@@ -26,7 +26,7 @@ from estimator.field.interpolation import (
     aberration_grid,
     accommodation_nodes_dpt,
 )
-from estimator.field.peripheral_residual import PeripheralResidual, held_refraction_um
+from estimator.field.peripheral_residual import PeripheralResidual, held_periphery_um
 from estimator.field.traced_fields import (
     ON_AXIS_DEG,
     FieldRange,
@@ -210,7 +210,7 @@ class TracedEye(FocusingEye):
         traced_deg = field.grid.h_deg, field.grid.v_deg
         periphery = peripheral_residual(eye, traced_deg)
         if periphery is not None and field.grid.accommodations_dpt.any():
-            phase_um = held_refraction_um(eye, field.grid, periphery)
+            phase_um = held_periphery_um(eye, field.grid, periphery)
             if np.isfinite(phase_um).all():
                 field.add(phase_um)
             else:  # light does not pass 4 mm everywhere; `periphery_note` reports it

@@ -19,6 +19,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from estimator.bounded_files import read_json
+from estimator.eye.assembly import (
+    ANTERIOR_CONIC,
+    DIAMETER,
+    accommodated_conic_constant,
+)
 from estimator.eye.parameters import PARAMETER_NAMES
 from estimator.optics.zernike import N_TERMS
 from estimator.threads import thread_count
@@ -56,6 +61,9 @@ OUTPUTS: Mapping[str, tuple[str, ...]] = {
 }
 
 NETWORK_NAMES = tuple(INPUTS)
+
+FOCUS_ITERATIONS = 3
+"""Evaluations of the focus network for one distance."""
 
 MARGIN_RATIO = 1e-6
 """Tolerance of the range check for rounding errors, as a fraction of the range."""
@@ -403,6 +411,9 @@ def network_focus(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the changes of the lens that focus relaxed eyes at given distances.
 
+    The network was trained on lenses that keep their conic constants.  It is evaluated
+    again with the anterior conic constant of the lens that it found.
+
     Parameters
     ----------
     vectors : (..., 45)
@@ -421,7 +432,13 @@ def network_focus(
     OutOfDomain, WeightsMissing, DamagedWeights
     """
     features = _features(vectors, pupil_diameter_mm, focus_dpt)
-    changes_mm = _shaped(load_network("focus"), features)
+    diameter_mm = features[..., DIAMETER]
+    relaxed_conic = features[..., ANTERIOR_CONIC].copy()
+    for _ in range(FOCUS_ITERATIONS):
+        changes_mm = _shaped(load_network("focus"), features)
+        features[..., ANTERIOR_CONIC] = accommodated_conic_constant(
+            relaxed_conic, diameter_ratio=1.0 + changes_mm[..., 0] / diameter_mm
+        )
     return changes_mm[..., 0], changes_mm[..., 1]
 
 

@@ -9,17 +9,22 @@ import pytest
 from estimator.estimate.estimation import estimate_eye
 from estimator.eye.accommodation import AccommodatingEye
 from estimator.eye.assembly import (
+    DIAMETER,
     SMALLEST_DIAMETER_RATIO,
     accommodated,
+    accommodated_conic_constant,
+    accommodated_eyes,
     eye_surfaces,
     lens_shape,
 )
-from estimator.eye.parameters import EyeParameters, RetinaShape
+from estimator.eye.parameters import EyeParameters, RetinaShape, random_vectors
 from estimator.eye.tracing import (
     refraction_of_vectors,
     seen_refraction_of_vectors,
 )
+from estimator.field.field_table import field_table
 from estimator.optics.prescription import C20, Prescription
+from estimator.optics.zernike import index_from_nm, rescale_pupil
 from estimator.profiles.measured_wavefront import MeasuredWavefront
 from estimator.profiles.parse import parse_profile, preset_names
 from estimator.wavefront.aberrations import wavefront_aberrations
@@ -27,6 +32,7 @@ from estimator.wavefront.field_wavefronts import (
     total_defocus_dpt,
     zernike_from_polynomial,
 )
+from tests import human_data
 from tests.numerical.spot_focus import (
     SPOT_DIAMETER_RATIO,
     focus_by_spot,
@@ -258,6 +264,76 @@ def test_a_focus_that_is_no_distance_is_refused(focus_dpt):
 def test_accommodating_to_the_relaxed_diameter_changes_nothing(myope):
     same = accommodated(myope, lens_diameter_mm=myope.lens_diameter_mm)
     assert same.to_vector() == pytest.approx(myope.to_vector(), abs=1e-12)
+    vectors = random_vectors(50, np.random.default_rng(2))
+    assert np.array_equal(accommodated_eyes(vectors, vectors[:, DIAMETER]), vectors)
+
+
+@pytest.mark.parametrize("conic_constant", [-4.4, -1.0, -0.3, 0.5])
+def test_the_anterior_surface_is_scaled_at_constant_volume(conic_constant):
+    """Points (x, z) of the relaxed surface move to (s x, z / s²)."""
+    s, volume_mm3 = 0.9, 160.0
+    relaxed, small = (
+        lens_shape(diameter_mm=d, volume_mm3=volume_mm3) for d in (9.5, 9.5 * s)
+    )
+    scaled_conic = accommodated_conic_constant(conic_constant, diameter_ratio=s)
+
+    def sag_mm(x_mm, radius_mm, k):
+        root = np.sqrt(1.0 - (1.0 + k) * (x_mm / radius_mm) ** 2)
+        return x_mm**2 / (radius_mm * (1.0 + root))
+
+    x_mm = np.linspace(0.0, 4.0, 9)
+    before_mm = sag_mm(x_mm, relaxed.anterior_radius_mm, conic_constant)
+    after_mm = sag_mm(s * x_mm, small.anterior_radius_mm, scaled_conic)
+    np.testing.assert_allclose(after_mm, before_mm / s**2, rtol=1e-12)
+
+
+def c40_um(profile, focus_dpt, pupil_mm):
+    table = field_table(
+        profile,
+        h_deg=0.0,
+        v_deg=0.0,
+        pupil_diameter_mm=pupil_mm,
+        wavelength_nm=555.0,
+        focus_dpt=focus_dpt,
+    )
+    zernike_um = rescale_pupil(
+        table.zernike_um,
+        radius_ratio=pupil_mm / 2.0 / table.zernike_radius_mm,
+    )
+    return float(zernike_um[0, index_from_nm(4, 0)])
+
+
+@pytest.mark.parametrize("pupil_mm", [4.0, 5.0, 6.0])
+@pytest.mark.parametrize(
+    ("sphere_dpt", "fields"),
+    [
+        (0.0, {"age_years": 20}),
+        (0.0, {"age_years": 32}),
+        (-6.0, {}),
+        (4.0, {}),
+        (0.0, {"kind": "preset", "name": "emmetropia"}),
+        (-6.0, {"kind": "preset", "name": "myopia"}),
+    ],
+)
+def test_spherical_aberration_falls_as_in_people(sphere_dpt, fields, pupil_mm):
+    prescription = {"kind": "prescription", "sphere_dpt": sphere_dpt}
+    profile = parse_profile(fields if "kind" in fields else prescription | fields)
+    far_dpt, near_dpt = np.array(human_data.MATHUR_FOCUS_DPT) - sphere_dpt
+    change_um = c40_um(profile, near_dpt, pupil_mm) - c40_um(profile, far_dpt, pupil_mm)
+    expected_um = human_data.mathur_slope_um(pupil_mm) * (near_dpt - far_dpt)
+    # Those of a lens that keeps its conic constants: 1.32 to 1.63.
+    assert 0.85 < change_um / expected_um < 1.2
+
+
+def test_the_response_that_spherical_aberration_takes_is_that_of_people():
+    """1/7 with natural pupils: between those of 5 and 6 mm."""
+    profile = parse_profile({"kind": "prescription", "sphere_dpt": 0.0})
+    taken = []
+    for pupil_mm in (4.0, 5.0, 6.0):
+        slope_um = (c40_um(profile, 6.0, pupil_mm) - c40_um(profile, 0.0, pupil_mm)) / 6
+        taken.append(float(human_data.taken_ratio(slope_um, pupil_mm)))
+    assert taken[0] < human_data.LOPEZ_GIL_RATIO < taken[-1]
+    assert taken[1] == pytest.approx(human_data.LOPEZ_GIL_RATIO, abs=0.015)
 
 
 def test_hexagonal_disc_is_even_and_unit():

@@ -32,7 +32,9 @@ def trace_aberrations(row):
 def trace_focus(row):
     """Output of a perfect focus network for one row of its inputs."""
     eye = AccommodatingEye(
-        EyeParameters.from_vector(row[:45]), pupil_diameter_mm=row[45]
+        EyeParameters.from_vector(row[:45]),
+        pupil_diameter_mm=row[45],
+        keeps_conics=True,
     )
     (state,) = eye.states_at(eye.accommodations_at_cornea_dpt(np.array([-row[46]])))
     return [state.lens_diameter_change_mm, state.aqueous_thickness_change_mm]

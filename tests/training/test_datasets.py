@@ -181,7 +181,9 @@ def test_lens_labels_are_what_the_accommodating_eye_finds():
     rows[:, -1] = np.linspace(0.2, 0.8, 6)  # within what the lens can do
     for row, found in zip(rows, DOMAINS["lens"].label(rows), strict=True):
         eye = AccommodatingEye(
-            EyeParameters.from_vector(row[:45]), pupil_diameter_mm=float(row[45])
+            EyeParameters.from_vector(row[:45]),
+            pupil_diameter_mm=float(row[45]),
+            keeps_conics=True,
         )
         used_dpt = eye.accommodations_at_cornea_dpt(np.array([-found[0]]))
         np.testing.assert_allclose(eye.at_cornea_dpt(used_dpt), -found[0], atol=1e-4)
@@ -220,7 +222,9 @@ def test_focus_labels_are_those_of_the_accommodating_eye():
     found = DOMAINS["focus"].label(rows)
     for k in (0, 17, 39, 40, 79):
         eye = AccommodatingEye(
-            EyeParameters.from_vector(rows[k, :45]), pupil_diameter_mm=rows[k, 45]
+            EyeParameters.from_vector(rows[k, :45]),
+            pupil_diameter_mm=rows[k, 45],
+            keeps_conics=True,
         )
         used_dpt = eye.accommodations_at_cornea_dpt(-rows[k, 46:47])
         np.testing.assert_allclose(found[k], eye.changes_mm(used_dpt)[0], atol=1e-6)
