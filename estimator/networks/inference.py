@@ -62,8 +62,9 @@ OUTPUTS: Mapping[str, tuple[str, ...]] = {
 
 NETWORK_NAMES = tuple(INPUTS)
 
-FOCUS_ITERATIONS = 3
-"""Evaluations of the focus network for one distance."""
+FOCUS_ITERATIONS = 4
+"""Evaluations of the focus network for one distance: after the fourth, the lens of a
+perfect network is met to 1e-6 mm."""
 
 MARGIN_RATIO = 1e-6
 """Tolerance of the range check for rounding errors, as a fraction of the range."""

@@ -61,7 +61,7 @@ CASES = {
     "pupil on a node": (("keratoconus", FIELD | MOVING), 5.0, 1.3, 0.3, None),
     "lowest end": (("keratoconus", FIELD | MOVING), 3.0, 0.0, 0.3, None),
     "highest end": (("emmetropia", FIELD | MOVING), 9.0, 6.0, 0.3, None),
-    "several accommodations": (("emmetropia", FIELD | MOVING), 3.7, 1.3, 0.3, None),
+    "several accommodations": (("emmetropia", FIELD | MOVING), 3.2, 1.3, 0.3, None),
     "accommodation on a node": (("emmetropia", FIELD | MOVING), 3.7, 0.0, 0.3, None),
     "beside single nodes": (("emmetropia", FIELD | BREATHING), 4.0, 0.5, 0.3, None),
     "two planes": (
@@ -72,8 +72,8 @@ CASES = {
         ("emmetropia", FIELD | STILL | {"gaze_range_deg": (12.0, 6.0)}),
         *(4.0, 1.0, 0.3, (-12.0, 5.0)),
     ),
-    "one used pair": (("emmetropia", FIELD | MOVING), 3.7, 1.3, 0.0, None),
-    "every pair": (("emmetropia", FIELD | MOVING), 3.7, 1.3, 1.0, None),
+    "one used pair": (("emmetropia", FIELD | MOVING), 3.2, 1.3, 0.0, None),
+    "every pair": (("emmetropia", FIELD | MOVING), 3.2, 1.3, 1.0, None),
     "a single layer": (
         ("emmetropia", AXIS | STILL | {"object_range_dpt": (1.0, 1.0)}),
         *(4.0, 1.0, 1.0, None),

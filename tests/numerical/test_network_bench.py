@@ -130,7 +130,8 @@ def test_errors_of_focus_are_the_networks_own(monkeypatch, few_nodes, vector):
     assert found["network", "mean_abs_mm", 0.0] < 1e-6
     assert found["network", "mean_abs_dpt", 0.0] < 1e-5
     assert found["exact", "mean_abs_dpt", 0.0] < 1e-6
-    assert found["network", "mean_abs_mm", -0.01] == pytest.approx(0.01, abs=1e-6)
+    # A wrong diameter also changes the conic constant that the network is given.
+    assert found["network", "mean_abs_mm", -0.01] == pytest.approx(0.01, rel=0.01)
     (nearer,) = np.flatnonzero(PUPILS_MM == 5.0) * 2 + 1
     nodes = network_nodes.focus_nodes(vector)[[nearer]]
     change_mm = network_nodes.reference_focus(nodes)

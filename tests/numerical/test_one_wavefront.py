@@ -96,7 +96,7 @@ def frames_of(profile):
         eye_filter.filter(color, depth_m.astype(np.float32), **view)
         store = eye_filter._eyes.eyes[0].stores[0].store.store
     plan = store.plan
-    pupil = int(np.abs(plan.pupils_mm - 4.0).argmin())
+    pupil = int(np.abs(plan.pupils_mm - 4.1).argmin())
     across, along = nodes_near(plan.h_deg, H_DEG), nodes_near(plan.v_deg, V_DEG)
     fields = (along[:, None] * len(plan.h_deg) + across).ravel()
     h_deg, v_deg = np.meshgrid(plan.h_deg[across], plan.v_deg[along])
