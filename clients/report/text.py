@@ -54,8 +54,8 @@ SOURCES = {
     "ratio (VSOTF)",
     "chart": "Ferris, Kassoff, Bresnick & Bailey 1982 (Am J Ophthalmol 94:91): the "
     "letter chart",
-    "straylight": "Vos & van den Berg 1999 (CIE Research Note 135/1): light scattered "
-    "in the eye",
+    "straylight": "Vos & van den Berg 1999 (CIE Research Note 135/1), van den Berg et "
+    "al. 2007 (Am J Ophthalmol 144:358): light scattered in the eye",
     "cataract": "J Ophthalmol 2017:5649532: straylight of cataracts before surgery",
 }
 

@@ -23,6 +23,7 @@ from filter_service.rendering.media_effects import (
 )
 from filter_service.rgbd_view import RgbdView
 from filter_service.view_state import State
+from tests import human_data
 
 WIDE = Camera.from_fov(50.0, width_px=640, height_px=360)
 
@@ -62,16 +63,33 @@ def test_the_glare_function_is_near_the_disability_glare_equation(
 
 @pytest.mark.parametrize("age_years", [20.0, 45.0, 65.0, 77.0])
 def test_the_straylight_parameter_is_that_of_measured_drivers(age_years):
-    """log s = 0.87 + log(1 + (age / 65)^4) at 7 deg, +-0.10 between people."""
-    norm = 0.87 + np.log10(1.0 + (age_years / 65.0) ** 4)
-    assert Straylight(age_years).age_log_s == pytest.approx(norm, abs=0.15)
+    """Its standard deviation between people is 0.10."""
+    eye = Straylight(age_years)
+    for angle_deg, limit in ((7.0, 1e-9), (10.0, 0.06)):
+        found = np.log10(angle_deg**2 * eye.per_sr(angle_deg))
+        norm = human_data.drivers_log_s(angle_deg, age_years)
+        assert found == pytest.approx(norm, abs=limit)
+    assert eye.age_log_s == pytest.approx(human_data.drivers_log_s(7.0, age_years))
+
+
+@pytest.mark.parametrize("pigmentation", [0.0, 1.0])
+def test_pigment_changes_straylight_as_in_the_glare_function(pigmentation):
+    brown, other = (Straylight(40.0, pigment) for pigment in (0.5, pigmentation))
+    change = other.per_sr(7.0) - brown.per_sr(7.0)
+    expected = cie_glare_per_sr(7.0, age_years=40.0, pigmentation=pigmentation)
+    expected -= cie_glare_per_sr(7.0, age_years=40.0)
+    assert change == pytest.approx(expected, rel=1e-9)
 
 
 @pytest.mark.parametrize("age_years", [25.0, 70.0])
 def test_beyond_a_degree_the_scatter_is_the_glare_function(age_years):
+    """And the drivers' excess: 14 and 30 % of its light at 7 deg."""
     angles_deg = np.linspace(1.0, 20.0, 200)
     found = Straylight(age_years).per_sr(angles_deg)
     expected = cie_glare_per_sr(angles_deg, age_years=age_years)
+    excess = 10.0 ** human_data.drivers_log_s(7.0, age_years)
+    excess -= 49.0 * cie_glare_per_sr(7.0, age_years=age_years)
+    expected += excess / angles_deg**2
     assert np.abs(np.log10(found / expected)).max() < 0.02
 
 
@@ -124,7 +142,7 @@ def lamp(camera, x, y, light=1e6):
 
 @pytest.mark.parametrize("straylight", [Straylight(25.0), Straylight(70.0, 1.0)])
 @pytest.mark.parametrize("angle_deg", [1.0, 2.0, 5.0, 10.0, 20.0])
-def test_light_about_a_lamp_is_that_of_the_glare_function(straylight, angle_deg):
+def test_light_about_a_lamp_is_that_of_the_function(straylight, angle_deg):
     x, y, light = 320, 180, 1e6
     seen = hazed(lamp(WIDE, x, y, light), WIDE, straylight)
     columns = np.arange(x + 1, WIDE.width_px).astype(float)
@@ -134,11 +152,7 @@ def test_light_about_a_lamp_is_that_of_the_glare_function(straylight, angle_deg)
     nearest = int(np.argmin(np.abs(angles_deg - angle_deg)))
     pixel_sr = np.prod(np.array(WIDE.pixel_pitch_mrad) / 1e3)
     found = seen[y, x + 1 + nearest, 1] / (light * pixel_sr)
-    per_sr = cie_glare_per_sr(
-        angles_deg[nearest],
-        age_years=straylight.age_years,
-        pigmentation=straylight.pigment_ratio,
-    )
+    per_sr = float(straylight.per_sr(angles_deg[nearest]))
     assert np.log10(found / per_sr) == pytest.approx(0.0, abs=0.1)
 
 
