@@ -321,7 +321,7 @@ def test_spherical_aberration_falls_as_in_people(sphere_dpt, fields, pupil_mm):
     far_dpt, near_dpt = np.array(human_data.MATHUR_FOCUS_DPT) - sphere_dpt
     change_um = c40_um(profile, near_dpt, pupil_mm) - c40_um(profile, far_dpt, pupil_mm)
     expected_um = human_data.mathur_slope_um(pupil_mm) * (near_dpt - far_dpt)
-    # Those of a lens that keeps its conic constants: 1.32 to 1.63.
+    # Those of a lens that keeps its conic constants: 1.32 to 1.62.
     assert 0.85 < change_um / expected_um < 1.2
 
 
