@@ -447,10 +447,12 @@ def _residual_covariance_um2(
     units = residual_um / deviation_um
     second_order = np.isin(TERMS, SECOND_ORDER).repeat(len(KNOTS_DEG))
     weights = _weights(units[:, second_order])
-    units = np.sqrt(weights)[:, None] * units
-    return _shrunk_covariance(units[weights > 0.0]) * np.outer(
-        deviation_um, deviation_um
-    )
+    used, weights = units[weights > 0.0], weights[weights > 0.0]
+    covariance = _shrunk_covariance(np.sqrt(weights)[:, None] * used)
+    # The weights estimate the size of deviations of the second order; for other terms
+    # they only weight a mean.
+    deviation_um[~second_order] /= np.sqrt(weights.mean())
+    return covariance * np.outer(deviation_um, deviation_um)
 
 
 def _weights(units: NDArray[np.float64]) -> NDArray[np.float64]:
