@@ -14,7 +14,7 @@ Means and deviations by term come from 200 eyes (Thibos et al. 2002, JOSA A 19:2
 Thibos, Bradley & Hong 2002, OPO 22:427), growth with age is from Berrio et al. 2010 (J
 Vis 10(14):34).  `POOL_RATIO` scales them to the RMS of 2,560 eyes (Salmon & van de Pol
 2006, JCRS 32:2064), 0.045, 0.100, 0.186 and 0.327 um at 3, 4, 5 and 6 mm: a typical
-young eye differs by at most 4 %, the mean of drawn ones by 3 %.
+young eye and the mean of drawn ones differ by at most 4 %.
 """
 
 import math
@@ -98,11 +98,11 @@ mm."""
 FREEDOM = 4
 """Degrees of freedom of the chi-square distribution of a drawn person's variance over
 its mean (a generalized Laplace distribution: Kotz, Kozubowski & Podgorski 2001).  The
-RMS has a standard deviation of 43 to 48 % of its mean in people (Thibos et al.) and 42
-to 49 % in drawn persons; in a normal distribution it would be 30 %.  The largest of
-1,000 has 3.2 times the mean RMS.  In a t-distribution with the same deviation it has
-3.9 times, and the eyes of Jaeken & Artal (IOVS 53(7), 2012; 129, on the axis, 4 mm) are
-less likely by 3.3 nat."""
+RMS has a standard deviation of 43 to 48 % of its mean in people (Thibos et al.) and in
+drawn persons; in a normal distribution it would be 30 %.  At 6 mm, the largest of 1,000
+has 3.2 times the mean RMS.  In a t-distribution with 7 degrees of freedom it has 3.9
+times, and the RMS of the eyes of Jaeken & Artal (IOVS 53(7), 2012; 129, on the axis, 4
+mm) is less likely by 3.3 nat."""
 
 LARGEST_RMS_UM = 1.05
 """Largest RMS of a drawn person at `TYPICAL_PUPIL_MM`, before growth with age; others
