@@ -243,3 +243,15 @@ def test_the_picture_is_drawn_and_small(tmp_path, people):
     file = tmp_path / "people.png"
     plot_findings(file, findings, curves)
     assert 10_000 < file.stat().st_size < 300_000
+
+
+def test_sources_of_acuity_out_of_focus_are_used_where_they_are_valid():
+    """Smith's law and 663 unaided eyes from 1 dpt on, Blendowske at natural pupils."""
+    assert human_data.published_log_mar(6.0, 0.0) == {"Elliott 1995": -0.13}
+    assert human_data.published_log_mar(5.0, 0.5) == {}
+    assert [*human_data.published_log_mar(3.0, 0.5)] == ["Blendowske 2015"]
+    assert [*human_data.published_log_mar(2.0, 1.0)] == ["Smith 1991"]
+    assert len(human_data.published_log_mar(4.0, 2.0)) == 3
+    # 2.91 x 2 + 0.51 x 5 - 3.14 = 5.23 minutes of arc
+    found = human_data.published_log_mar(5.0, 2.0)["663 eyes, 2016"]
+    assert found == pytest.approx(math.log10(5.23))
