@@ -1,10 +1,11 @@
 from .acuity.best_correction import best_correction_um as best_correction_um
+from .acuity.observer import log_mar_of as log_mar_of
 from .acuity.predict import Acuity as Acuity
-from .acuity.predict import log_mar_of as log_mar_of
 from .acuity.predict import predict_acuity as predict_acuity
 from .acuity.transfer import Transfer as Transfer
 from .acuity.transfer import optical_transfer as optical_transfer
 from .acuity.transfer import perfect_transfer as perfect_transfer
+from .acuity.transfer import white_light_transfer as white_light_transfer
 from .bounded_files import InvalidFile as InvalidFile
 from .corrections.progressive import ProgressiveLens as ProgressiveLens
 from .corrections.rings import DiffractiveRings as DiffractiveRings

@@ -34,6 +34,7 @@ from estimator import (
     predict_acuity,
     prepare_eye,
     preset_names,
+    white_light_transfer,
 )
 
 SECOND_ORDER = slice(3, 6)
@@ -94,7 +95,7 @@ class PupilWavefront:
 
     @cached_property
     def predicted(self) -> Acuity | None:
-        """Return acuity and visual Strehl ratio.
+        """Return acuity in white light, and visual Strehl ratio.
 
         None if the wavefront is too steep to be resolved, and through lenslets.
         """
@@ -166,8 +167,25 @@ class PupilWavefront:
             "pupil_screen": self.rings,
         }
 
+    @property
+    def untilted_um(self) -> NDArray[np.float64]:
+        """Return the coefficients without tilt: the image's position is irrelevant."""
+        zernike_um = self.zernike_um.copy()
+        zernike_um[TILTS] = 0.0
+        return zernike_um
+
+    def white_light_transfer(self) -> Transfer:
+        """Return the optical transfer function for white light, as `log_mar_of` needs.
+
+        Raises
+        ------
+        ValueError
+            As for `transfer`.
+        """
+        return white_light_transfer(self.untilted_um, **self._pupil)
+
     def transfer(self, **options: Any) -> Transfer:
-        """Return the optical transfer function.
+        """Return the optical transfer function for one wavelength.
 
         Parameters
         ----------
@@ -179,9 +197,7 @@ class PupilWavefront:
         ValueError
             If the wavefront is too steep to be resolved, or through lenslets.
         """
-        zernike_um = self.zernike_um.copy()
-        zernike_um[TILTS] = 0.0  # the image's position is irrelevant
-        return optical_transfer(zernike_um, **self._pupil, **options)
+        return optical_transfer(self.untilted_um, **self._pupil, **options)
 
 
 @dataclass(frozen=True)
@@ -209,7 +225,7 @@ def acuity_log_mar(wavefront: PupilWavefront) -> float:
     if not wavefront.is_readable:
         return np.nan
     try:
-        return log_mar_of(wavefront.transfer())
+        return log_mar_of(wavefront.white_light_transfer())
     except ValueError:
         return np.inf
 

@@ -118,8 +118,8 @@ def vision_table(facts: EyeFacts) -> Table:
 def vision_note(pupils: list[dict[str, Any]]) -> str:
     """Return the note below numbers of vision through some pupils."""
     note = (
-        "Acuity in logMAR, and as a decimal. Higher orders: in the entrance pupil; "
-        "maps and bars show them at the cornea."
+        "Acuity in logMAR, and as a decimal, in white light. Higher orders: in the "
+        "entrance pupil; maps and bars show them at the cornea."
     )
     if any(p["is_beyond_measured"] for p in pupils):
         note += " * wider than the pupil measured: see “What is known”."
@@ -136,6 +136,9 @@ def distance_text(distance_dpt: float) -> str:
     where = f"{100 * distance_m:.0f} cm" if distance_m < 1.0 else f"{distance_m:.1f} m"
     return f"{distance_dpt:.2f} ({where})"
 
+
+LEAST_RATIO = 0.0005
+"""Smallest visual Strehl ratio that three decimals show."""
 
 VISION_ROWS: dict[str, Callable[[dict[str, Any]], str]] = {
     "higher orders, RMS, µm": lambda p: f"{p['higher_order_rms_um']:.2f}",
@@ -161,7 +164,10 @@ def pupil_text(pupil: dict[str, Any]) -> str:
 
 
 def _ratio(value: float | None) -> str:
-    return "–" if value is None else f"{max(value, 0.0):.3f}"
+    """Return a visual Strehl ratio, which under strong blur is near 0 or negative."""
+    if value is None:
+        return "–"
+    return "< 0.001" if value < LEAST_RATIO else f"{value:.3f}"
 
 
 def _modulations(values: dict[str, Any] | None) -> str:

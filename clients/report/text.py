@@ -48,6 +48,12 @@ SOURCES = {
     "length": "Atchison 2006 (Vision Res 46:2236): eye length and corneal radius by "
     "refraction",
     "acuity": "Watson & Ahumada 2008 (J Vis 8(4):17): acuity from a wavefront",
+    "edge": "Atchison, Scott, Strang & Artal 2002 (JOSA A 19:1073): acuity and the "
+    "Stiles-Crawford effect",
+    "photons": "Barten 1999 (Contrast sensitivity of the human eye, SPIE): photon and "
+    "neural noise",
+    "reversed": "Akutsu, Bedell & Patel 2000 (Optom Vis Sci 77:524): letters blurred "
+    "by defocus",
     "nerves": "Watson & Ahumada 2005 (J Vis 5(9):6), Watson 2013 (J Vis 13(6):18): "
     "contrast sensitivity of people and their mean optics",
     "strehl": "Thibos, Hong, Bradley & Applegate 2004 (J Vis 4(4):9): visual Strehl "
@@ -372,8 +378,12 @@ def _rows(study: EyeStudy, cite: Citations) -> tuple[tuple[str, ...], ...]:
             "Acuity",
             "predicted",
             "a template observer with a young adult's retina and nerves reads what the "
-            f"optics leave {cite('acuity', 'nerves')}; amblyopia or disease is not in "
-            f"it; visual Strehl ratio {cite('strehl')}, charts {cite('chart')}",
+            f"optics leave {cite('acuity', 'nerves')}, in white light at 160 cd/m², "
+            f"with the Stiles-Crawford effect {cite('edge')} and photon noise "
+            f"{cite('photons')}, without detail that blur reverses {cite('reversed')}; "
+            "amblyopia or disease is not in it; visual Strehl ratio "
+            f"{cite('strehl')}, 0 or negative where most detail is reversed; charts "
+            f"{cite('chart')}",
         ),
         _worn(study),
     )

@@ -1,6 +1,9 @@
 """Optical transfer functions of eyes and predicted visual acuity.
 
-transfer         optical transfer functions, and human contrast sensitivity
+transfer         optical transfer functions, of one wavelength and of white light, and
+                 human contrast sensitivity
+letters          the ten Sloan letters
+observer         acuity of an observer who reads letters through a transfer function
 predict          visual Strehl ratio and acuity of a wavefront, through focus and over
                  the field, where the density of retinal cells limits acuity
 best_correction  sphere and cylinder with the highest visual Strehl ratio

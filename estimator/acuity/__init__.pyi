@@ -1,9 +1,9 @@
 from .best_correction import best_correction_um as best_correction_um
+from .observer import log_mar_of as log_mar_of
 from .predict import Acuity as Acuity
 from .predict import FieldAcuity as FieldAcuity
 from .predict import acuity_over_field as acuity_over_field
 from .predict import acuity_through_focus as acuity_through_focus
-from .predict import log_mar_of as log_mar_of
 from .predict import predict_acuity as predict_acuity
 from .predict import retina_log_mar as retina_log_mar
 from .predict import retina_nyquist_cpd as retina_nyquist_cpd
@@ -11,3 +11,4 @@ from .transfer import Transfer as Transfer
 from .transfer import mean_eye_transfer as mean_eye_transfer
 from .transfer import neural_sensitivity as neural_sensitivity
 from .transfer import optical_transfer as optical_transfer
+from .transfer import white_light_transfer as white_light_transfer

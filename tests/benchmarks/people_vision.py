@@ -6,8 +6,8 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.acuity import predict_acuity
-from estimator.optics.prescription import C20, zernike_from_power_vector
+from estimator.acuity import best_correction_um, predict_acuity
+from estimator.optics.prescription import zernike_from_power_vector
 from estimator.optics.zernike import rescale_pupil
 from estimator.profiles.parse import parse_profile
 from tests import human_data
@@ -27,13 +27,19 @@ AGES_YEARS = (20, 40, 60, 70, 80)
 
 
 def log_mar(axis_um: NDArray[np.float64], pupil_mm: float) -> NDArray[np.float64]:
-    """Return acuities (9,) in focus and at `DEFOCUS_DPT` of an axis (28,) on 6 mm."""
-    scaled_um = rescale_pupil(axis_um, radius_ratio=pupil_mm / LARGEST_PUPIL_MM)
-    scaled_um[C20] = 0.0
+    """Return acuities (9,) in focus and at `DEFOCUS_DPT` of an axis (28,) on 6 mm.
+
+    Defocus counts from the best correction, as in people.
+    """
+    corrected_um = best_correction_um(
+        rescale_pupil(axis_um, radius_ratio=pupil_mm / LARGEST_PUPIL_MM),
+        zernike_radius_mm=pupil_mm / 2.0,
+        wavelength_nm=555.0,
+    )
     return np.array(
         [
             predict_acuity(
-                scaled_um
+                corrected_um
                 + zernike_from_power_vector(
                     -defocus, 0.0, 0.0, zernike_radius_mm=pupil_mm / 2.0
                 ),

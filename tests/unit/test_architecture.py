@@ -52,6 +52,7 @@ MAY_IMPORT = {
         "estimator.parse_profile",  # and whether it is one
         "estimator.thread_count",
         "estimator.dynamics",  # of an eye that looks
+        "estimator.acuity.letters",  # shapes of letters on charts
         *FACE,
         *EYE_FACE,
     ),
@@ -85,7 +86,7 @@ EYE_ROOMS = {
     "psf": ("native", "optics"),
     "corrections": ("wavefront", "optics"),
     "media": (),
-    "acuity": ("optics",),
+    "acuity": ("psf", "optics"),
     "dynamics": (),
     "eye": ("corrections", "wavefront", "optics"),
     "profiles": ("eye", "corrections", "media", "wavefront", "optics"),

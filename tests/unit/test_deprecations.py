@@ -3,6 +3,10 @@
 import re
 import tomllib
 
+import numpy as np
+import pytest
+
+from estimator.acuity import Transfer, log_mar_of
 from filter_service.messages import PROTOCOL_VERSION
 from tests.source_tree import PACKAGES, ROOT, python_files
 
@@ -44,3 +48,11 @@ def test_every_warning_names_a_version_to_come():
     ]
     assert len(versions) == n_warnings
     assert all(_version(version) > _current() for version in versions)
+
+
+def test_the_number_of_bisections_of_acuity_is_deprecated():
+    frequency_cpd = np.arange(-40, 41) * 0.05
+    transfer = Transfer(frequency_cpd, np.eye(81)[::-1] + 0j)
+    with pytest.deprecated_call(match="n_bisections has no effect"):
+        found = log_mar_of(transfer, n_bisections=8)
+    assert found == log_mar_of(transfer)

@@ -8,7 +8,7 @@ import pytest
 from tests.source_tree import PACKAGES, ROOT, python_files
 
 UNITS = (
-    *("mm", "um", "nm", "m", "mm3", "deg", "rad", "mrad", "arcmin", "dpt", "px"),
+    *("mm", "um", "nm", "m", "mm2", "mm3", "deg", "rad", "mrad", "arcmin", "dpt", "px"),
     *("s", "ms", "hz", "db", "mb", "bytes", "years", "nit", "cpd"),
 )
 KINDS = ("ratio", "index", "count", "fraction", "constant")
