@@ -66,7 +66,7 @@ QUANTUM_EFFICIENCY = 0.03
 NEURAL_NOISE = 3e-8
 """Spectral density of neural noise above 7 cycles per degree, s deg²."""
 
-OBSERVER_NOISE = 4.91e5
+OBSERVER_NOISE = 4.92e5
 """Variance of the noise of templates per `NEURAL_NOISE`.
 
 With it, the typical young eye, best corrected for 4 mm, reads -0.13 logMAR, as people

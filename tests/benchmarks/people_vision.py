@@ -53,7 +53,7 @@ def log_mar(axis_um: NDArray[np.float64], pupil_mm: float) -> NDArray[np.float64
 def acuity_findings(
     seeds: Sequence[int], pupils_mm: Sequence[float] = PUPILS_MM
 ) -> Iterator[Finding]:
-    """Yield the mean difference from, and the squared correlation with, each law."""
+    """Yield acuity in focus; and out of focus, mean and squared correlation by law."""
     for eyes, profiles in emmetropes(seeds).items():
         axes_um = [
             on_circle_um(profile, 0.0, pupil_diameter_mm=LARGEST_PUPIL_MM)[0]
@@ -70,6 +70,12 @@ def acuity_findings(
                 lost = human_data.blendowske_lost_log_mar(DEFOCUS_DPT)
                 ours_lost = blurred - in_focus[:, None]
                 laws["Blendowske 2015"] = lost, "logMAR lost", ours_lost
+            yield Finding(
+                *("acuity in focus", eyes, f"best corrected, {pupil_mm:g} mm"),
+                *(float(in_focus.mean()), human_data.YOUNG_LOG_MAR, "logMAR"),
+                *("Elliott 1995", len(found), elapsed_ms),
+                band=band_of(in_focus),
+            )
             setting = f"{DEFOCUS_DPT[0]:g} to {DEFOCUS_DPT[-1]:g} dpt, {pupil_mm:g} mm"
             for source, (theirs, unit, ours) in laws.items():
                 same = (source, len(found), elapsed_ms)

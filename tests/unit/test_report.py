@@ -49,7 +49,12 @@ from clients.report.html_page import (
     html_of,
 )
 from clients.report.make import Record, document_of, write_report
-from clients.report.tables import change_text, refraction_table, vision_table
+from clients.report.tables import (
+    VISION_ROWS,
+    change_text,
+    refraction_table,
+    vision_table,
+)
 from clients.report.text import (
     SOURCES,
     Citations,
@@ -717,3 +722,12 @@ def test_the_command_writes_a_report_and_prints_the_numbers_alone(command):
     assert (ended.returncode, ended.stderr) == (0, "")
     found = json.loads(ended.stdout)["eye"]["refraction"]
     assert found["M_dpt"] == pytest.approx(sum(AT_CORNEA) / 2, abs=0.01)
+
+
+@pytest.mark.parametrize(
+    ("ratio", "expected"),
+    [(None, "–"), (0.1234, "0.123"), (0.0004, "< 0.001"), (-0.00035, "< 0.001")],
+)
+def test_a_visual_strehl_ratio_near_zero_is_not_shown_as_zero(ratio, expected):
+    state = {"visual_strehl_ratio": ratio}
+    assert VISION_ROWS["visual Strehl as it is"]({"as_it_is": state}) == expected
