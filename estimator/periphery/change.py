@@ -309,7 +309,7 @@ def _conditioned(
         random = np.random.RandomState([sample, FIELD_STREAM])
         jitter = np.diag(RELATIVE_JITTER * scale**2)
         root = np.linalg.cholesky(covariance + jitter)
-        size = min(math.sqrt((FREEDOM - 2) / random.chisquare(FREEDOM)), LARGEST_SIZE)
+        size = drawn_size(random)
         prior_um = prior_um + size * (root @ random.standard_normal(scale.size))
         draw = OffMeridianDraw.draw(random, size)
         noise_um = np.sqrt(noise_um2) * random.standard_normal(noise_um2.size)
