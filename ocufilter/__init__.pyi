@@ -59,6 +59,7 @@ from estimator import published_names as published_names
 from estimator import rescale_pupil as rescale_pupil
 from estimator import thread_count as thread_count
 from estimator import wavefront_aberrations as wavefront_aberrations
+from estimator import white_light_transfer as white_light_transfer
 from estimator import zernike_values as zernike_values
 from filter_service import Accumulation as Accumulation
 from filter_service import BadMessage as BadMessage

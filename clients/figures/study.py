@@ -50,6 +50,9 @@ PAST_LAST_FOCUS_DPT = 1.0
 NEAREST_DPT = 5.0
 PAST_FAR_POINT_DPT = 2.0
 HIGHEST_DPT = 20.0
+ACUITY_TOLERANCE_LOG_MAR = 0.005
+"""Difference below which two acuities are equal: reports show 0.01."""
+
 MIN_ACCOMMODATION_DPT = 1e-6
 """Smallest accommodation range; an eye with less is treated as fixed-focus."""
 
@@ -150,7 +153,7 @@ class PupilWavefront:
         if mine is None or its is None:
             return its is None
         has_ratio = mine.visual_strehl_ratio >= its.visual_strehl_ratio
-        return has_ratio and mine.log_mar <= its.log_mar
+        return has_ratio and mine.log_mar <= its.log_mar + ACUITY_TOLERANCE_LOG_MAR
 
     @property
     def _least_squares(self) -> PupilWavefront:

@@ -98,10 +98,13 @@ def predict_acuity(
 
 def _neural_integral(transfer: Transfer) -> float:
     """Integrate the real part of a transfer, weighted by neural sensitivity."""
-    radial_cpd = transfer.radial_cpd
     step_cpd = transfer.frequency_cpd[1] - transfer.frequency_cpd[0]
+    first, last = np.searchsorted(transfer.frequency_cpd, (-HIGHEST_CPD, HIGHEST_CPD))
+    visible_cpd = transfer.frequency_cpd[first:last]
+    radial_cpd = np.hypot(visible_cpd[:, None], visible_cpd)
     weight = np.where(radial_cpd <= HIGHEST_CPD, neural_sensitivity(radial_cpd), 0.0)
-    return float((weight * transfer.transfer_ratio.real).sum() * step_cpd**2)
+    real = transfer.transfer_ratio[first:last, first:last].real
+    return float((weight * real).sum() * step_cpd**2)
 
 
 PEAK_PER_DEG2 = 33163.2

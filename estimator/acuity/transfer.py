@@ -334,14 +334,16 @@ def _autocorrelation(
     """
     pupil = clear * np.exp(2j * np.pi * wavefront_um * UM_PER_MM / wavelength_nm)
     padded = fft.next_fast_len(max(2 * len(pupil), 2 * n_steps + 2))
-    # One axis after the other: half the rows of the pupil are padding, and only some
-    # of the transfer is kept.
+    # One axis after the other, as half the rows are padding.  The intensity is
+    # real, so that one half of its transform gives the other.
     field = fft.fft(fft.fft(pupil, padded, axis=1), padded, axis=0)
-    intensity = field.real**2 + field.imag**2
+    half = fft.rfft(field.real**2 + field.imag**2, axis=1)[:, : n_steps + 1]
     kept = np.arange(-n_steps, n_steps + 1) % padded
-    transfer = fft.ifft(fft.ifft(intensity, axis=0)[kept], axis=1)[:, kept]
-    found: NDArray[np.complex128] = transfer / transfer[n_steps, n_steps]
-    return found
+    half = np.conj(fft.fft(half, axis=0)[kept])
+    found = np.empty((2 * n_steps + 1,) * 2, dtype=np.complex128)
+    found[:, n_steps:] = half
+    found[:, :n_steps] = np.conj(half[::-1, :0:-1])
+    return found / found[n_steps, n_steps]
 
 
 def clear_pupil(
