@@ -190,9 +190,9 @@ CIRCLE_MM = 2.0
 """Radius of the circle of the coefficients."""
 
 KNOTS_DEG = (-40.0, -30.0, -20.0, -10.0, 10.0, 20.0, 30.0, 40.0)
-"""Azimuths h of the knots, in a right eye.  In the mean, people's M rises by 0.1 dpt from
-the axis to 5 deg temporal and falls beyond; knots at 10 deg miss that, which makes the
-modulation of drawn persons at 5 deg 0.02 too high."""
+"""Azimuths h of the knots, in a right eye.  In the mean, people's M rises by 0.1 dpt
+from the axis to 5 deg temporal and falls beyond; knots at 10 deg miss that, which makes
+the modulation of drawn persons at 5 deg 0.02 too high."""
 
 MEASURED_DEG = 40.0
 """Largest measured angle; beyond it, the slope decays exponentially."""
