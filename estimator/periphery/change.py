@@ -131,9 +131,9 @@ class PeripheralChange:
         Wavefront on the axis, on the circle of `population`.
     is_in_population : bool
         Whether it belongs to the eye and is not clamped to the population's range.
-    knots_um : (96,)
+    knots_um : (120,)
         Change at the knots.
-    sphere_deviation_dpt : (8,)
+    sphere_deviation_dpt : (10,)
         Standard deviation of the change of M at the knots.
     off_meridian_h_deg, off_meridian_v_deg : (m,)
         Measured directions other than the axis.
@@ -340,7 +340,7 @@ def drawn_size(random: np.random.RandomState) -> float:
 
 
 def _sphere_deviation_dpt(variances_um2: NDArray[Any]) -> NDArray[np.float64]:
-    """Return the standard deviation (8,) of M from variances (96,) at the knots."""
+    """Return the standard deviation (10,) of M from variances (120,) at the knots."""
     sphere_um2 = variances_um2.reshape(len(TERMS), -1)[TERMS.index(4)]
     return SPHERE_PER_C20 * np.sqrt(np.maximum(sphere_um2, 0.0)) / CIRCLE_MM**2
 

@@ -50,6 +50,9 @@ SMOOTHING_RATIO = 0.15
 """Standard deviation of the Gaussian weights, over the angle of a knot, of the fit of a
 parabola about it.  The change is small near the axis, and no window extends past it."""
 
+LEAST_SMOOTHING_DEG = 1.5
+"""Smallest standard deviation; directions are 1 deg apart."""
+
 LEAST_POINTS = 2
 MAX_FILE_BYTES = 10_000_000
 """Size limit of a file and of each of its arrays; 130 eyes take 0.4 MB."""
@@ -163,13 +166,14 @@ def _arrays(file: Path) -> dict[str, NDArray[np.float64]]:
 
 
 def knots_um(eyes: MeasuredEyes) -> NDArray[np.float64]:
-    """Return smoothed changes (n, 12, 8) at the knots; NaN where not measured."""
+    """Return smoothed changes (n, 12, 10) at the knots; NaN where not measured."""
     change_um, h_deg = eyes.change_um, eyes.h_deg
     found = np.full((len(change_um), len(TERMS), len(KNOTS_DEG)), np.nan)
     for eye, rows_um in enumerate(change_um):
         is_known = np.isfinite(rows_um).all(axis=1)
         for knot, at_deg in enumerate(KNOTS_DEG):
-            away, width_deg = h_deg - at_deg, SMOOTHING_RATIO * abs(at_deg)
+            away = h_deg - at_deg
+            width_deg = max(SMOOTHING_RATIO * abs(at_deg), LEAST_SMOOTHING_DEG)
             if (is_known & (np.abs(away) <= width_deg)).sum() < LEAST_POINTS:
                 continue
             near = is_known & (np.abs(away) <= 2.5 * width_deg)
@@ -189,10 +193,10 @@ SECOND_ORDER = (3, 4, 5)
 CIRCLE_MM = 2.0
 """Radius of the circle of the coefficients."""
 
-KNOTS_DEG = (-40.0, -30.0, -20.0, -10.0, 10.0, 20.0, 30.0, 40.0)
-"""Azimuths h of the knots, in a right eye.  In the mean, people's M rises by 0.1 dpt
-from the axis to 5 deg temporal and falls beyond; knots at 10 deg miss that, which makes
-the modulation of drawn persons at 5 deg 0.02 too high."""
+KNOTS_DEG = (-40.0, -30.0, -20.0, -10.0, -5.0, 5.0, 10.0, 20.0, 30.0, 40.0)
+"""Azimuths h of the knots, in a right eye.  Those at 5 deg are there because M, in the
+mean, rises by 0.1 dpt between the axis and 5 deg temporal, and falls beyond: a spline
+without them misses that, and the modulation at 5 deg is 0.02 too high."""
 
 MEASURED_DEG = 40.0
 """Largest measured angle; beyond it, the slope decays exponentially."""
@@ -212,7 +216,7 @@ _AZIMUTHAL_ORDERS = (
 
 
 def meridian_weights(h_deg: ArrayLike) -> NDArray[np.float64]:
-    """Return spline weights (..., 8) of the knots at azimuths (...), 0 on the axis."""
+    """Return spline weights (..., 10) of the knots at azimuths (...), 0 on the axis."""
     h_deg = np.asarray(h_deg, dtype=np.float64)
     spline = _spline()
     inside = np.clip(h_deg, -MEASURED_DEG, MEASURED_DEG)
@@ -224,14 +228,14 @@ def meridian_weights(h_deg: ArrayLike) -> NDArray[np.float64]:
 @cache
 def _spline() -> CubicSpline:
     nodes = np.array(sorted((*KNOTS_DEG, 0.0)))
-    values = np.delete(np.eye(nodes.size), KNOTS_DEG.index(10.0), axis=1)
+    values = np.delete(np.eye(nodes.size), nodes.searchsorted(0.0), axis=1)
     return CubicSpline(nodes, values)
 
 
 def field_terms(
     h_deg: ArrayLike, v_deg: ArrayLike, knots: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return terms (n, 12) at directions (n,) from those at the knots (12, 8).
+    """Return terms (n, 12) at directions (n,) from those at the knots (12, 10).
 
     The result is the product of `field_matrix` and the knots, in a tenth of the time,
     because most of the matrix is zero.
@@ -254,7 +258,7 @@ def field_terms(
 
 
 def field_matrix(h_deg: ArrayLike, v_deg: ArrayLike) -> NDArray[np.float64]:
-    """Return the matrix (n, 12, 12, 8) from terms at the knots to directions (n,)."""
+    """Return the matrix (n, 12, 12, 10) from terms at the knots to directions (n,)."""
     h_deg, v_deg = np.broadcast_arrays(np.atleast_1d(h_deg), np.atleast_1d(v_deg))
     angle_deg, azimuth = np.hypot(h_deg, v_deg), np.arctan2(v_deg, h_deg)
     right, left = meridian_weights(angle_deg), meridian_weights(-angle_deg)
@@ -301,7 +305,7 @@ ones."""
 LARGEST_SIZE = 2.0
 """Largest factor of an eye's deviations in the t-distribution, which one in 130 eyes
 exceeds, as many as were measured.  Drawn persons have no larger one, as in a screened
-population, and five measured eyes of four people that have are not used for the
+population, and six measured eyes of five people that have are not used for the
 covariance.  With the limit, deviations and correlations of people left out are
 predicted better in 4 and in 5 of five training sets."""
 
@@ -316,12 +320,12 @@ RIDGE = 1e-4
 
 @dataclass(frozen=True, eq=False)
 class Population:
-    """Normal distribution of 12 terms at 9 positions, the axis first.
+    """Normal distribution of 12 terms at 11 positions, the axis first.
 
     Attributes
     ----------
-    mean_um, deviation_um : (12, 9)
-    correlation_ratio : (108, 108)
+    mean_um, deviation_um : (12, 11)
+    correlation_ratio : (132, 132)
         Correlations, in C order of terms and positions.
     """
 
@@ -395,7 +399,7 @@ def _rounded(values: NDArray[np.float64]) -> list[Any]:
 
 
 def _by_terms() -> NDArray[np.int64]:
-    """Return indices (108,) that sort axis and knots by terms and positions."""
+    """Return indices (132,) that sort axis and knots by terms and positions."""
     axis = np.arange(len(TERMS))[:, None]
     knots = len(TERMS) + np.arange(len(TERMS) * len(KNOTS_DEG))
     return np.concatenate([axis, knots.reshape(len(TERMS), -1)], axis=1).ravel()
@@ -404,7 +408,7 @@ def _by_terms() -> NDArray[np.int64]:
 def _ridge_regression(
     axis_um: NDArray[np.float64], changes_um: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return slopes (96, 12) and intercepts (96,) over the centered axis (n, 12)."""
+    """Return slopes (120, 12) and intercepts (120,) over the centered axis (n, 12)."""
     deviation_um = axis_um.std(axis=0)
     penalty = np.full(len(TERMS), OTHER_RIDGE)
     penalty[TERMS.index(4)] = SPHERE_RIDGE
@@ -429,7 +433,7 @@ def _ridge_regression(
 def _residual_covariance_um2(
     residual_um: NDArray[np.float64], is_left: NDArray[np.bool_]
 ) -> NDArray[np.float64]:
-    """Return the covariance (96, 96) of residuals (n, 96), some of them missing.
+    """Return the covariance (120, 120) of residuals (n, 120), some of them missing.
 
     Both sides are centered.  The mean J45 of mirrored left eyes differs from that of
     right ones, in the same direction at both sides of the field, by 0.15 dpt at 30 deg:
@@ -479,7 +483,7 @@ def _weights(units: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _shrunk_covariance(units: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the shrunk covariance (96, 96) about 0 of rows with missing values."""
+    """Return the shrunk covariance (120, 120) about 0 of rows with missing values."""
     covariance, shrinkage = np.eye(units.shape[1]), _shrinkage()
     for _ in range(EM_ITERATIONS):
         filled, imputed_covariance = _imputed(units, covariance)
@@ -509,7 +513,7 @@ def _imputed(
 
 
 def _shrinkage() -> NDArray[np.float64]:
-    """Return the shrinkage factors (96, 96) of sample covariances."""
+    """Return the shrinkage factors (120, 120) of sample covariances."""
     term = np.repeat(TERMS, len(KNOTS_DEG))
     is_m_or_j0 = np.isin(term, (4, 5))
     shrinkage = np.full((term.size, term.size), OTHER_TERM_SHRINKAGE)
