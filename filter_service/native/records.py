@@ -22,8 +22,7 @@ FRAGMENT = np.dtype(
         ("x", "<u2"),
         ("y", "<u2"),
         ("state", "<u4"),
-        ("fraction", "<u2"),
-        ("radius_px", "<u2"),
+        ("fraction", "<u4"),
     ]
 )
 FRAGMENT_LIGHT = np.dtype([("rgb", "<f4", 3), ("depth", "<f4")])
@@ -32,11 +31,14 @@ BLOCK = np.dtype(
     [
         ("first", "<u4"),
         ("end", "<u4"),
+        ("first_cluster", "<u4"),
+        ("end_cluster", "<u4"),
         ("radius_px", "<u2"),
         ("has_edge", "u1"),
         ("merged", "u1"),
     ]
 )
+CLUSTER_BYTES = 32
 KERNEL_IMAGE_BYTES = 128
 RECIPE_IMAGE_BYTES = 16
 
@@ -101,6 +103,7 @@ class Frame(c.Structure):
         ("lights", POINTER),
         ("extras", POINTER),
         ("blend_shares", POINTER),
+        ("clusters", POINTER),
         ("boxes", POINTER * 4),
         ("blocks", POINTER),
         ("fragment_count", c.c_int64),
@@ -346,6 +349,7 @@ SIZES = (
     c.sizeof(Frame),
     FRAGMENT.itemsize,
     BLOCK.itemsize,
+    CLUSTER_BYTES,
     KERNEL_SHAPE.itemsize,
     KERNEL_IMAGE_BYTES,
     RECIPE_IMAGE_BYTES,

@@ -123,9 +123,9 @@ def test_threads_and_processors_give_the_same_picture(case):
     assert again.tobytes() == usual.tobytes()
 
 
-@pytest.mark.parametrize("radius_px", [30, 60])
+@pytest.mark.parametrize("radius_px", [12, 30, 60])
 def test_coarse_pixels_cost_little(rng, monkeypatch, radius_px):
-    """Squares of 8 under kernels that wide light pixels of 2 px (30) or 4 px (60)."""
+    """Squares under kernels that wide light pixels of 2 px (12) or 4 px (30, 60)."""
     width_px, height_px = 3 * radius_px, 2 * radius_px + 21
     bench = OneKernelBench(
         Engine("native"),
@@ -142,5 +142,5 @@ def test_coarse_pixels_cost_little(rng, monkeypatch, radius_px):
     fine = bench.render(image).color
     assert 55.0 <= psnr_db(coarse, fine) <= 90.0
     truth = bench.plane_truth(image)
-    # a disc's rim is the worst there is: 1.9 dB at 60 px, below 1.5 at 30
-    assert psnr_db(coarse, truth) >= psnr_db(fine, truth) - 2.5
+    # without sharpening, 1.2 to 2.4 dB
+    assert psnr_db(coarse, truth) >= psnr_db(fine, truth) - 0.5

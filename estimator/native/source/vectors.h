@@ -190,6 +190,15 @@ INLINE f32x8 twice4(f32x4 value) {
 #endif
 }
 
+/* The same from memory: one load. */
+INLINE f32x8 load_twice4(const float *from) {
+#if defined(OCU_AVX2) && !defined(__clang__) /* clang makes one load of two */
+    return __builtin_ia32_vbroadcastf128_ps256((const f32x4 *)from);
+#else
+    return twice4(load4(from));
+#endif
+}
+
 /* Copies the second of each four lanes to the fourth. */
 INLINE f32x8 second_as_fourth8(f32x8 value) {
     return MIXED(value, value, 0, 1, 2, 1, 4, 5, 6, 5);

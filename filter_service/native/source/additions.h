@@ -1,34 +1,39 @@
-/* Accumulation of fragments in the pixels of a window. */
+/* Addition of fragments to the pixels of a bin, cluster by cluster: a small convolution. */
 
 #include "frame.h"
 #include "vectors.h"
 
-/* Read access of a fragment to its kernel. */
-typedef struct {
-    const level_image *image;
-    i32x8 factors;            /* near and far share of each pair */
-    int left, top;            /* first column and row of the kernel in the raster */
-} reading;
+INLINE const level_image *image_of(const frame *f, uint32_t state) {
+    return f->kernels[state & KERNEL_MASK].level + (state >> LEVEL_SHIFT & 3);
+}
 
-/* Fragments of the hidden surface follow those of the visible one. */
+/* Item: one row of blocks.  Replaces the fraction of fragments by the shares of both ends of
+ * their kernels, in 15 bits. */
+static void set_factors(void *argument, int row, int thread) {
+    const frame *f = argument;
+    const block_info *blocks = f->blocks + row * f->block_columns;
+    (void)thread;
+    for (uint32_t at = blocks->first_cluster; at < blocks[f->block_columns - 1].end_cluster; ++at) {
+        const cluster *own = f->clusters + at;
+        const level_image *image = image_of(f, own->state);
+        float per_step = image->far_ratio * (1.0f / 65535.0f);
+        float near_per_step = image->near_ratio * (1.0f / 65535.0f);
+        for (fragment *one = f->fragments + own->first; one < f->fragments + own->first + own->count;
+             ++one) {
+            int near = (int)((float)(65535 - (int)one->fraction) * near_per_step + 0.5f);
+            int far = (int)((float)(int)one->fraction * per_step + 0.5f);
+            one->fraction = (uint32_t)near | (uint32_t)far << 16;
+        }
+    }
+}
+
+/* Clusters and fragments of the hidden surface follow those of the visible one. */
 INLINE int is_hidden(const frame *f, uint32_t index) {
     return index >= (uint32_t)(f->block_rows * f->block_columns * f->block_slots);
 }
 
-INLINE const level_image *image_of(const frame *f, const fragment *one) {
-    return f->kernels[one->state & KERNEL_MASK].level + (one->state >> LEVEL_SHIFT & 3);
-}
-
-INLINE reading start_reading(const fragment *one, const level_image *image,
-                             const raster *own) {
-    float fraction = (float)one->fraction * (1.0f / 65535.0f);
-    int near = (int)((1.0f - fraction) * image->near_ratio + 0.5f);
-    int far = (int)(fraction * image->far_ratio + 0.5f);
-    int32_t factor = (int32_t)((uint32_t)near | (uint32_t)far << 16);
-    return (reading){image,
-                     {factor, factor, factor, factor, factor, factor, factor, factor},
-                     (one->x >> image->resolution) - image->left - own->x0,
-                     (one->y >> image->resolution) - image->up - own->y0};
+INLINE i32x8 all_ints8(int32_t value) {
+    return (i32x8){value, value, value, value, value, value, value, value};
 }
 
 INLINE i32x8 read_pairs(const uint32_t *from) {
@@ -37,9 +42,176 @@ INLINE i32x8 read_pairs(const uint32_t *from) {
     return pairs;
 }
 
-INLINE const uint32_t *row_texels(const frame *f, const reading *r, int row) {
-    ptrdiff_t texel = (ptrdiff_t)r->image->first_texel + (ptrdiff_t)row * (r->image->width + 1);
-    return f->kernel_texels + 4 * (texel - r->left);
+/* A fragment as it is added to a raster. */
+typedef struct {
+    f32x4 color;              /* the fourth lane is the strength of an edge, or no matter */
+    int32_t factors;          /* shares of both ends of its kernel */
+    int32_t from;             /* texel of its kernel at the first pixel of the raster, from the
+                               * first one of the kernel */
+    int32_t top;              /* of its kernel in the raster */
+    int32_t left;
+} member;
+
+/* Fragments of a cluster that are added to a raster. */
+typedef struct {
+    int count;
+    int is_plain;             /* scales are 1; no strength and no excess */
+    member of[BLOCK_PIXELS];
+    f32x4 scales[BLOCK_PIXELS]; /* of coverage; the fourth lane is the excess light */
+} members;
+
+#define ALL_GROUPS INT32_MIN
+
+/* Share of a fragment that belongs to a group of depths. */
+INLINE float share_of_group(const frame *f, uint32_t at, int32_t group) {
+    float place = group_place(f, f->lights[at].depth);
+    int32_t own = group_of(place);
+    if (own == group) return 1.0f - share_behind(place);
+    return own == group - 1 ? share_behind(place) : 0.0f;
+}
+
+INLINE member member_of(const frame *f, uint32_t at, const level_image *image,
+                        const raster *own) {
+    const fragment *one = f->fragments + at;
+    int r = image->resolution;
+    int left = (one->x >> r) - image->left - own->x0, top = (one->y >> r) - image->up - own->y0;
+    return (member){load4((const float *)(f->lights + at)), (int32_t)one->fraction,
+                    -left - top * row_texels(image), top, left};
+}
+
+/* Returns whether all depths of a cluster belong to one group alone. */
+INLINE int is_in_one_group(const frame *f, const cluster *from) {
+    float farthest = group_place(f, from->farthest);
+    return group_of(group_place(f, from->nearest)) == group_of(farthest)
+           && share_behind(farthest) <= 0.0f;
+}
+
+/* Lists the fragments of a cluster with a share in a group of depths. */
+INLINE void list_members(const frame *f, const cluster *from, int32_t group,
+                         const level_image *image, const raster *own, members *all) {
+    if (group != ALL_GROUPS && is_in_one_group(f, from)) group = ALL_GROUPS;
+    all->is_plain =
+        !(from->state & SPECIAL_BIT) && group == ALL_GROUPS && f->blend_shares == NULL;
+    if (all->is_plain) {
+        all->count = (int)from->count;
+        for (int i = 0; i < all->count; ++i)
+            all->of[i] = member_of(f, from->first + (uint32_t)i, image, own);
+        return;
+    }
+    all->count = 0;
+    for (uint32_t at = from->first; at < from->first + from->count; ++at) {
+        float share = group == ALL_GROUPS ? 1.0f : share_of_group(f, at, group);
+        if (share <= 0.0f) continue;
+        if (f->blend_shares != NULL) share *= f->blend_shares[at];
+        member one = member_of(f, at, image, own);
+        f32x4 scales = {share, share, share, 0.0f};
+        one.color *= scales;
+        if (f->fragments[at].state & SPECIAL_BIT) {
+            const fragment_extra *extra = f->extras + at;
+            float coverage = share * extra->coverage;
+            one.color += (f32x4){0.0f, 0.0f, 0.0f, share * extra->strength};
+            scales = (f32x4){coverage, coverage, coverage, share * extra->excess};
+        }
+        all->scales[all->count] = scales;
+        all->of[all->count++] = one;
+    }
+}
+
+/* Keeps the members that touch columns of a raster; returns their number. */
+static int keep_touching(const members *all, int first, int end, int width, members *to) {
+    int count = 0;
+    for (int i = 0; i < all->count; ++i) {
+        to->of[count] = all->of[i];
+        if (!all->is_plain) to->scales[count] = all->scales[i];
+        count += all->of[i].left < end && all->of[i].left + width > first;
+    }
+    return count;
+}
+
+#define COLUMN_PAIRS 4
+#define PREFETCHED_ROWS 3
+
+/* Prefetches what a member reads in a row of a kernel: three cache lines at most. */
+INLINE void prefetch_row(const uint32_t *texels) {
+    const char *from = (const char *)texels;
+    for (int n = 0; n < 3; ++n) __builtin_prefetch(from + 64 * n);
+}
+
+/* Adds members to `pairs` adjacent pairs of pixels, row by row: the sums of a row stay in
+ * registers.  The compiler generates a loop for each number of pairs. */
+INLINE void add_columns(const frame *f, const members *all, int count, const level_image *image,
+                        raster *own, int pair, int pairs, int is_plain) {
+    ptrdiff_t stride = 4 * (ptrdiff_t)row_texels(image);
+    const member *one = all->of, *end = all->of, *last = all->of + count;
+    int row = larger_int(one->top, 0);
+    int last_row = smaller_int(last[-1].top + image->height, own->height);
+    const uint32_t *texels =
+        f->kernel_texels + 4 * (size_t)image->first_texel + row * stride + 8 * pair;
+    pixel_pair *to = own->pairs + row * own->stride + pair;
+    float scale = image->scale;
+    f32x8 scales = twice4((f32x4){scale, scale, scale, is_plain ? 0.0f : scale});
+    for (; row < last_row; ++row, texels += stride, to += own->stride) {
+        while (end < last && end->top <= row) ++end;
+        while (one < end && one->top + image->height <= row) ++one;
+        f32x8 light[COLUMN_PAIRS], coverage[COLUMN_PAIRS];
+        for (int p = 0; p < pairs; ++p) light[p] = coverage[p] = all8(0.0f);
+        if (one < end) {
+            prefetch_row(texels + PREFETCHED_ROWS * stride + 4 * (ptrdiff_t)one->from);
+            prefetch_row(texels + PREFETCHED_ROWS * stride + 4 * (ptrdiff_t)end[-1].from);
+        }
+        for (const member *next = one; next < end; ++next) {
+            const uint32_t *from = texels + 4 * (ptrdiff_t)next->from;
+            f32x8 color = load_twice4((const float *)&next->color);
+            i32x8 factors = all_ints8(next->factors);
+            for (int p = 0; p < pairs; ++p) {
+                f32x8 weight = __builtin_convertvector(
+                    pair_sums(read_pairs(from + 8 * p), factors), f32x8);
+                light[p] += weight * color;
+                if (is_plain) coverage[p] += weight;
+                else coverage[p] +=
+                    weight * load_twice4((const float *)(all->scales + (next - all->of)));
+            }
+        }
+        for (int p = 0; p < pairs; ++p) {
+            to[p].light += light[p] * scales;
+            to[p].coverage += coverage[p] * scales;
+        }
+    }
+}
+
+/* Adds a cluster to a group of depths; fragments without a share in it are left out. */
+static void add_cluster(const frame *f, uint32_t at, int32_t number, depth_group *group) {
+    const cluster *from = f->clusters + at;
+    const level_image *image = image_of(f, from->state);
+    raster *own = group->sizes + image->resolution;
+    members all, some;        /* are not cleared */
+    list_members(f, from, number, image, own, &all);
+    if (all.count == 0) return;
+    light_rows(own, all.of[0].top, all.of[all.count - 1].top + image->height);
+    int r = image->resolution;
+    int leftmost = (from->left >> r) - image->left - own->x0;
+    int extent = (1 << (from->state >> LEVEL_SHIFT & 3)) - 1;
+    int rightmost = ((from->right - extent) >> r) - image->left - own->x0;
+    int left = larger_int(leftmost, 0) / 2;
+    int right = smaller_int((rightmost + image->width + 1) / 2, own->width / 2);
+    int columns = (right - left + COLUMN_PAIRS - 1) / COLUMN_PAIRS;
+    for (int pair = left, pairs; pair < right; pair += pairs, --columns) {
+        pairs = (right - pair + columns - 1) / columns;
+        int first = 2 * pair, end = first + 2 * pairs, count = all.count;
+        const members *touch = &all;
+        if (rightmost >= end || leftmost + image->width <= first) {
+            count = keep_touching(&all, first, end, image->width, &some);
+            touch = &some;
+            if (count == 0) continue;
+        }
+#define CASE(n)                                                                    \
+    case n:                                                                        \
+        if (all.is_plain) add_columns(f, touch, count, image, own, pair, n, 1);    \
+        else add_columns(f, touch, count, image, own, pair, n, 0);                 \
+        break;
+        switch (pairs) { CASE(1) CASE(2) CASE(3) CASE(4) default: break; }
+#undef CASE
+    }
 }
 
 /* Pairs and rows of a raster that a kernel's box overlaps. */
@@ -48,156 +220,30 @@ typedef struct {
     int row, rows;            /* of the kernel */
 } meeting;
 
-INLINE meeting meet(const reading *r, const raster *own) {
-    int pair = larger_int(r->left, 0) / 2;
-    int row = larger_int(-r->top, 0);
-    return (meeting){pair, (smaller_int(r->left + r->image->width, own->width) + 1) / 2 - pair,
-                     row, smaller_int(own->height - r->top, r->image->height) - row};
-}
-
-/* Rows of a raster that a fragment is added to, and the data to add. */
-typedef struct {
-    pixel_pair *to;
-    int to_stride, rows, pairs;
-    const uint32_t *from;
-    int from_stride;
-    i32x8 factors;
-    f32x8 color, scales;
-} addition;
-
-INLINE f32x8 weights_of(const addition *a, const uint32_t *from) {
-    return __builtin_convertvector(pair_sums(read_pairs(from), a->factors), f32x8);
-}
-
-/* Adds one fragment; the compiler generates a loop for each number of pairs. */
-INLINE void add_rows(const addition *a, int pairs) {
-    pixel_pair *to = a->to;
-    const uint32_t *from = a->from;
-    for (int row = 0; row < a->rows; ++row, to += a->to_stride, from += a->from_stride) {
-        for (int pair = 0; pair < pairs; ++pair) {
-            f32x8 weight = weights_of(a, from + 8 * pair);
-            to[pair].light += weight * a->color;
-            to[pair].coverage += weight * a->scales;
-        }
-    }
-}
-
-/* Adds two fragments to the same rows: sums are read and written once for both. */
-INLINE void add_both_rows(const addition *a, const addition *b, int pairs) {
-    pixel_pair *to = a->to;
-    const uint32_t *from_a = a->from;
-    const uint32_t *from_b = b->from;
-    for (int row = 0; row < a->rows; ++row) {
-        for (int pair = 0; pair < pairs; ++pair) {
-            f32x8 weight_a = weights_of(a, from_a + 8 * pair);
-            f32x8 weight_b = weights_of(b, from_b + 8 * pair);
-            f32x8 light = to[pair].light + weight_a * a->color;
-            f32x8 coverage = to[pair].coverage + weight_a * a->scales;
-            to[pair].light = light + weight_b * b->color;
-            to[pair].coverage = coverage + weight_b * b->scales;
-        }
-        to += a->to_stride;
-        from_a += a->from_stride;
-        from_b += b->from_stride;
-    }
-}
-
-#define FOR_EACH_WIDTH(CASE) CASE(1) CASE(2) CASE(3) CASE(4) CASE(5) CASE(6) CASE(7) CASE(8)
-
-static void add_one(const addition *a) {
-#define CASE(pairs) case pairs: add_rows(a, pairs); return;
-    switch (a->pairs) { FOR_EACH_WIDTH(CASE) default: return; }
-#undef CASE
-}
-
-static void add_both(const addition *a, const addition *b) {
-#define CASE(pairs) case pairs: add_both_rows(a, b, pairs); return;
-    switch (a->pairs) { FOR_EACH_WIDTH(CASE) default: return; }
-#undef CASE
-}
-
-/* Prepares the addition of a share of a fragment to a group; false if it lights only other
- * parts of the bin.  A plain fragment has no extra values and no share of a cell, and its
- * raster is clear: many bins have no others, and take a twelfth less time without the checks. */
-INLINE int prepare_addition(const frame *f, uint32_t index, float share, int is_plain,
-                            depth_group *group, addition *a) {
-    const fragment *one = f->fragments + index;
-    const float *light = (const float *)(f->lights + index);
-    const level_image *image = image_of(f, one);
-    raster *own = group->sizes + image->resolution;
-    reading r = start_reading(one, image, own);
-    meeting m = meet(&r, own);
-    if (m.pairs <= 0 || m.rows <= 0) return 0;
-    if (!is_plain && f->blend_shares != NULL) share *= f->blend_shares[index];
-    float scale = image->scale * share;
-    f32x4 colors = load4(light) * (f32x4){scale, scale, scale, 0.0f}; /* without the depth */
-    f32x4 scales = {scale, scale, scale, 0.0f};
-    if (!is_plain && one->state & SPECIAL_BIT) {
-        const fragment_extra *extra = f->extras + index;
-        float coverage = scale * extra->coverage;
-        colors[3] = scale * extra->strength;
-        scales = (f32x4){coverage, coverage, coverage, scale * extra->excess};
-    }
-    if (is_plain) own->is_lit = 1;
-    else light_raster(own);
-    a->to = own->pairs + (m.row + r.top) * own->stride + m.pair;
-    a->to_stride = own->stride;
-    a->rows = m.rows;
-    a->pairs = m.pairs;
-    a->from = row_texels(f, &r, m.row) + 8 * m.pair;
-    a->from_stride = 4 * (image->width + 1);
-    a->factors = r.factors;
-    a->color = twice4(colors);
-    a->scales = twice4(scales);
-    return 1;
-}
-
-/* Pending additions: one waits for another to the same rows. */
-typedef struct {
-    addition two[2];
-    int waiting;              /* 0 or 1 */
-} additions;
-
-INLINE void flush_additions(additions *all) {
-    if (all->waiting) add_one(all->two);
-    all->waiting = 0;
-}
-
-INLINE void add_fragment(const frame *f, uint32_t index, float share, int is_plain,
-                         depth_group *group, additions *all) {
-    addition *newest = all->two + all->waiting;
-    if (!prepare_addition(f, index, share, is_plain, group, newest)) return;
-    if (!all->waiting) {
-        all->waiting = 1;
-        return;
-    }
-    const addition *first = all->two;
-    if (first->to == newest->to && first->pairs == newest->pairs
-        && first->rows == newest->rows) {
-        add_both(first, newest);
-        all->waiting = 0;
-        return;
-    }
-    add_one(first);
-    all->two[0] = *newest;
+INLINE meeting meet(const member *one, const level_image *image, const raster *own) {
+    int pair = larger_int(one->left, 0) / 2;
+    int row = larger_int(-one->top, 0);
+    return (meeting){pair, (smaller_int(one->left + image->width, own->width) + 1) / 2 - pair,
+                     row, smaller_int(own->height - one->top, image->height) - row};
 }
 
 /* The paper's rule: a weight is an opacity; merging has one level, of four pixels. */
 INLINE void cover_with_fragment(const frame *f, uint32_t index, const window *w) {
     const fragment *one = f->fragments + index;
     const float *rgb = f->lights[index].rgb;
-    const level_image *image = image_of(f, one);
-    const raster *own = w->open[0].sizes;
-    reading r = start_reading(one, image, own);
-    meeting m = meet(&r, own);
+    const level_image *image = image_of(f, one->state);
+    member own = member_of(f, index, image, w->open.sizes);
+    meeting m = meet(&own, image, w->open.sizes);
+    i32x8 factors = all_ints8(own.factors);
     f32x8 color = {rgb[0], rgb[1], rgb[2], 0.0f, rgb[0], rgb[1], rgb[2], 0.0f};
     int merged = (one->state >> LEVEL_SHIFT & 3) != 0;
     for (int row = m.row; row < m.row + m.rows; ++row) {
-        const uint32_t *from = row_texels(f, &r, row) + 8 * m.pair;
-        pixel_pair *to = w->near + (row + r.top) * PAIRS_ACROSS + m.pair;
+        ptrdiff_t texel = (ptrdiff_t)image->first_texel + row * row_texels(image);
+        const uint32_t *from = f->kernel_texels + 4 * (texel - own.left + 2 * m.pair);
+        pixel_pair *to = w->near + (row + own.top) * PAIRS_ACROSS + m.pair;
         for (int pair = 0; pair < m.pairs; ++pair) {
             f32x8 weight = __builtin_convertvector(
-                pair_sums(read_pairs(from + 8 * pair), r.factors), f32x8);
+                pair_sums(read_pairs(from + 8 * pair), factors), f32x8);
             weight *= all8(image->scale);
             if (merged) {
                 f32x8 through = all8(1.0f) - smaller8(weight * all8(0.25f), all8(1.0f));

@@ -21,6 +21,7 @@ typedef struct {
     f32x4 bright;             /* light above which it is not amplified */
     uint64_t held;            /* pixels that are not empty */
     uint64_t edges;           /* pixels next to another surface, or hidden */
+    uint64_t special;         /* pixels that may need extra values */
     int highest_level;        /* of merging, over the pixels' kernels */
     float tolerance;          /* of merging, at this angle from the gaze */
     float smallest_spread_px; /* of kernels that merge */
@@ -96,19 +97,30 @@ INLINE int cell_row(const frame *f, int y) {
 
 INLINE int cell_column(const frame *f, int x) { return f->cell_px ? f->column_cell[x] : 0; }
 
-/* Reads a row of a block into pixels i and on; its first pixel in the frame is `first`. */
-INLINE void read_row(block *b, int i, size_t first, int width) {
+/* Reads the light of a row of pixels. */
+INLINE void read_light(block *b, int i, size_t first, int width) {
     const frame *f = b->f;
-    size_t pixels = (size_t)f->width * (size_t)f->height;
-    const float *dpt = f->dpt + (size_t)b->surface * pixels + first;
-    const float *place = f->position + (size_t)b->surface * pixels + first;
-    const float *seen_dpt = f->dpt + first;
+    if (f->color_kind == COLOR_SRGB8) {
+        const uint8_t *bytes = (const uint8_t *)f->color[b->surface] + RGB * first;
+        for (int x = 0; x < width; ++x)
+            for (int c = 0; c < RGB; ++c) b->rgb[c][i + x] = linear_of_byte[bytes[RGB * x + c]];
+        return;
+    }
+    for (int x = 0; x < width; ++x) {
+        f32x4 color = pixel_color(f, b->surface, first + (size_t)x);
+        for (int c = 0; c < RGB; ++c) b->rgb[c][i + x] = color[c];
+    }
+}
+
+/* Sets the kernels of a row of pixels, and their spread. */
+INLINE void read_kernels(block *b, int i, const float *place, int width) {
+    const frame *f = b->f;
     int row = cell_row(f, b->y0 + i / TILE_SIZE_PX);
     int last_pair = -1;
     uint32_t kernel = 0;
     const kernel_shape *shape = f->shapes;
     for (int x = 0; x < width; ++x, ++i) {
-        if (dpt[x] < 0.0f) continue;
+        if (!(b->held >> i & 1)) continue;
         int interval = position_interval(f, place[x]);
         int pair = (row + cell_column(f, b->x0 + x)) * f->interval_count + interval;
         if (pair != last_pair) {
@@ -118,17 +130,35 @@ INLINE void read_row(block *b, int i, size_t first, int width) {
             b->highest_level = larger_int(b->highest_level, shape->highest_level);
         }
         float change_px = shape->spread_px[1] - shape->spread_px[0];
-        f32x4 color = pixel_color(f, b->surface, first + (size_t)x);
-        if (b->surface > 0) {
-            b->share[i] = f->paper_rule ? 1.0f : hidden_coverage(f, seen_dpt[x], dpt[x]);
-            color *= all4(b->share[i]);
-        }
-        for (int c = 0; c < RGB; ++c) b->rgb[c][i] = color[c];
-        b->dpt[i] = dpt[x];
-        b->place[i] = place[x];
         b->spread_px[i] = shape->spread_px[0] + (place[x] - (float)interval) * change_px;
         b->kernel[i] = kernel;
-        b->held |= (uint64_t)1 << i;
+    }
+}
+
+/* Reads a row of a block into pixels i and on; its first pixel in the frame is `first`. */
+INLINE void read_row(block *b, int i, size_t first, int width) {
+    const frame *f = b->f;
+    size_t pixels = (size_t)f->width * (size_t)f->height;
+    const float *dpt = f->dpt + (size_t)b->surface * pixels + first;
+    const float *place = f->position + (size_t)b->surface * pixels + first;
+    if (width == TILE_SIZE_PX) {
+        b->held |= (uint64_t)bits_of8(load8(dpt) >= all8(0.0f)) << i;
+    } else {
+        for (int x = 0; x < width; ++x) b->held |= (uint64_t)(dpt[x] >= 0.0f) << (i + x);
+    }
+    if (!(b->held >> i & 255)) return;
+    memcpy(b->dpt + i, dpt, sizeof *dpt * (size_t)width);
+    memcpy(b->place + i, place, sizeof *place * (size_t)width);
+    read_light(b, i, first, width);
+    read_kernels(b, i, place, width);
+    if (b->surface == 0) return;
+    const float *seen_dpt = f->dpt + first;
+    for (int x = 0; x < width; ++x) {
+        int held = (int)(b->held >> (i + x) & 1);
+        float share = !held ? 0.0f : f->paper_rule ? 1.0f : hidden_coverage(f, seen_dpt[x], dpt[x]);
+        b->share[i + x] = share;
+        for (int c = 0; c < RGB; ++c) b->rgb[c][i + x] *= share;
+        if (!held) b->dpt[i + x] = b->place[i + x] = 0.0f;
     }
 }
 

@@ -60,26 +60,27 @@ INLINE void add_quarters(const coarse_row *row, pixel_pair *to, int pairs) {
  * four. */
 INLINE void add_coarse(depth_group *group, int r) {
     raster *coarse = group->sizes + r;
-    const raster *fine = group->sizes;
+    raster *fine = group->sizes;
     coarse_row row;
-    for (int y = 0; y < fine->height; ++y) {
+    /* Pixel y lies between the coarse rows (y + 0.5) / 2^r + 0.5, rounded down, and the next. */
+    int top = larger_int((coarse->top - 2) << r, 0);
+    int bottom = smaller_int((coarse->bottom + 1) << r, fine->height);
+    light_rows(fine, top, bottom);
+    for (int y = top; y < bottom; ++y) {
         float down = ((float)y + 0.5f) / (float)(1 << r) + 0.5f;
         row_between(coarse, coarse->pairs + (int)down * coarse->stride, down - (float)(int)down,
                     &row);
         if (r == 1) add_halves(&row, fine->pairs + y * fine->stride, fine->width / 2);
         else add_quarters(&row, fine->pairs + y * fine->stride, fine->width / 2);
     }
-    coarse->is_lit = 0;
+    darken_raster(coarse);
 }
 
 /* Converts all light of a group to pixels of 1 px; false if it has none. */
 static int gather_sizes(depth_group *group) {
-    for (int r = 1; r < RESOLUTIONS; ++r) {
-        if (!group->sizes[r].is_lit) continue;
-        light_raster(group->sizes);
-        add_coarse(group, r);
-    }
-    return group->sizes[0].is_lit;
+    for (int r = 1; r < RESOLUTIONS; ++r)
+        if (group->sizes[r].top < group->sizes[r].bottom) add_coarse(group, r);
+    return group->sizes[0].top < group->sizes[0].bottom;
 }
 
 INLINE float least_color(f32x8 lanes) {
@@ -105,14 +106,26 @@ INLINE void close_excess(const pixel_pair *open, pixel_pair *near, f32x8 room, f
     near->coverage += share * open->coverage;
 }
 
+/* Whether groups behind the closed ones matter, by the rows of a window. */
+INLINE int state_of(const window *w) {
+    float least = 1.0f, strength = EDGE_MIX_COVERAGE;
+    for (int y = 0; y < w->height; ++y) {
+        least = smaller_float(w->least[y], least);
+        strength = smaller_float(w->least_strength[y], strength);
+    }
+    if (least < 1.0f) return SEEN;
+    return strength < EDGE_MIX_COVERAGE ? COVERED : UNSEEN;
+}
+
 /* Composites a group; its fragments share the coverage that nearer ones leave. */
 static int close_group(window *w, depth_group *group) {
     if (!gather_sizes(group)) return SEEN;
-    f32x8 least = all8(1.0f), least_total = all8(1.0f);
-    for (int y = 0; y < w->height; ++y) {
-        const pixel_pair *open = group->sizes[0].pairs + y * PAIRS_ACROSS;
+    raster *own = group->sizes;
+    for (int y = own->top; y < own->bottom; ++y) {
+        const pixel_pair *open = own->pairs + y * PAIRS_ACROSS;
         pixel_pair *near = w->near + y * PAIRS_ACROSS;
         pixel_pair *total = w->total + y * PAIRS_ACROSS;
+        f32x8 least = all8(1.0f), least_total = all8(1.0f);
         for (int x = 0; x < w->width / 2; ++x) {
             f32x8 light = open[x].light, coverage = open[x].coverage;
             f32x8 most = larger8(coverage, all8(MIN_COVERAGE));
@@ -129,17 +142,17 @@ static int close_group(window *w, depth_group *group) {
             least = smaller8(near[x].coverage, least);
             least_total = smaller8(total[x].light, least_total);
         }
+        w->least[y] = least_color(least);
+        w->least_strength[y] = smaller_float(least_total[3], least_total[7]);
     }
-    group->sizes[0].is_lit = 0;
-    if (least_color(least) < 1.0f) return SEEN;
-    float strength = smaller_float(least_total[3], least_total[7]);
-    return strength < EDGE_MIX_COVERAGE ? COVERED : UNSEEN;
+    darken_raster(own);
+    return state_of(w);
 }
 
 /* Adds a group to the total alone. */
 static void add_total(window *w, depth_group *group) {
     if (!gather_sizes(group)) return;
-    for (int y = 0; y < w->height; ++y) {
+    for (int y = group->sizes[0].top; y < group->sizes[0].bottom; ++y) {
         const pixel_pair *open = group->sizes[0].pairs + y * PAIRS_ACROSS;
         pixel_pair *total = w->total + y * PAIRS_ACROSS;
         for (int x = 0; x < w->width / 2; ++x) {
@@ -147,86 +160,37 @@ static void add_total(window *w, depth_group *group) {
             total[x].coverage += open[x].coverage;
         }
     }
+    darken_raster(group->sizes);
 }
 
-/* Two consecutive groups of depths, and what waits to be added to each. */
-typedef struct {
-    float number;             /* of the nearer group */
-    int nearer;               /* its index in the window, 0 or 1 */
-    int state;
-    additions all[2];
-} depth_walk;
-
-/* Closes the nearer group: the one behind it becomes the nearer one. */
-INLINE void close_nearer(window *w, depth_walk *walk) {
-    depth_group *group = w->open + walk->nearer;
-    flush_additions(walk->all + walk->nearer);
-    if (walk->state == SEEN) walk->state = close_group(w, group);
-    else add_total(w, group);
-    walk->nearer ^= 1;
-}
-
-/* Adds a fragment, nearest first.  In the last part of a group, it passes gradually to the
- * next one, so that no depth is special. */
-INLINE void add_behind(const frame *f, uint32_t index, window *w, depth_walk *walk) {
-    float place = f->lights[index].depth * f->blur_px_per_dpt * (1.0f / DISCONTINUITY_PX);
-    float number = __builtin_floorf(place);
-    if (walk->state == SEEN && number > walk->number) {
-        close_nearer(w, walk);
-        if (walk->state == SEEN && number > walk->number + 1.0f) close_nearer(w, walk);
-        walk->number = number;
+/* Light of a bin in which order matters: group of depths by group, nearest first.  Once nearer
+ * groups cover everything, all others count alike. */
+static void splat_ordered(const frame *f, const bin_list *list, window *w) {
+    int state = SEEN;
+    for (int i = 0; i < list->count && state != UNSEEN;) {
+        uint32_t key = list->keys[i];
+        for (; i < list->count && (state != SEEN || list->keys[i] == key); ++i)
+            add_cluster(f, list->entries[i], list->first_group + (int32_t)list->keys[i], &w->open);
+        if (state == SEEN) {
+            state = close_group(w, &w->open);
+        } else {
+            add_total(w, &w->open);
+            break;
+        }
     }
-    int nearer = walk->nearer;
-    float next = (place - number - (1.0f - GROUP_BLEND_RATIO)) * (1.0f / GROUP_BLEND_RATIO);
-    next = walk->state == SEEN ? larger_float(next, 0.0f) : 0.0f;
-    add_fragment(f, index, 1.0f - next, 0, w->open + nearer, walk->all + nearer);
-    if (next > 0.0f)
-        add_fragment(f, index, next, 0, w->open + (nearer ^ 1), walk->all + (nearer ^ 1));
-}
-
-/* Light of a tile in which order matters: depth by depth. */
-static void splat_ordered(const frame *f, const bin_list *list, uint32_t tile, window *w) {
-    depth_walk walk = {.number = -INFINITY, .state = SEEN};
-    for (int i = 0; i < list->count && walk.state != UNSEEN; ++i) {
-        if (!(list->entries[i].tiles & tile)) continue;
-        add_behind(f, list->entries[i].fragment, w, &walk);
-        w->has_hidden |= is_hidden(f, list->entries[i].fragment);
-    }
-    if (walk.state == UNSEEN) return;
-    close_nearer(w, &walk);
-    close_nearer(w, &walk);
 }
 
 /* The paper's rule: fragment by fragment. */
-static void splat_in_order(const frame *f, const bin_list *list, uint32_t tile, window *w) {
-    for (int i = 0; i < list->count; ++i)
-        if (list->entries[i].tiles & tile) cover_with_fragment(f, list->entries[i].fragment, w);
+static void splat_in_order(const frame *f, const bin_list *list, window *w) {
+    for (int i = 0; i < list->count; ++i) cover_with_fragment(f, list->entries[i], w);
 }
 
-/* Light of plain fragments. */
-static void splat_plain(const frame *f, const bin_list *list, uint32_t tiles, window *w) {
-    additions all = {.waiting = 0};
-    for (int r = 0; r < RESOLUTIONS; ++r) {
-        begin_raster(w->open->sizes + r);
-        w->open->sizes[r].is_lit = 0;
-    }
-    for (int i = 0; i < list->count; ++i)
-        if (list->entries[i].tiles & tiles)
-            add_fragment(f, list->entries[i].fragment, 1.0f, 1, w->open, &all);
-    flush_additions(&all);
-    gather_sizes(w->open);
-}
-
-/* Light of all fragments, or of the visible surface alone, regardless of order. */
-static void splat_unordered(const frame *f, const bin_list *list, uint32_t tiles,
-                            int with_hidden, window *w) {
-    additions all = {.waiting = 0};
-    for (int i = 0; i < list->count; ++i) {
-        uint32_t index = list->entries[i].fragment;
-        if (!(list->entries[i].tiles & tiles)) continue;
-        if (with_hidden || !is_hidden(f, index)) add_fragment(f, index, 1.0f, 0, w->open, &all);
-    }
-    flush_additions(&all);
-    light_raster(w->open[0].sizes);
-    gather_sizes(w->open);
+/* Light of all clusters, or of the visible surface alone, regardless of order. */
+static void splat_unordered(const frame *f, const bin_list *list, int with_hidden, window *w) {
+    for (int r = 0; r < RESOLUTIONS; ++r) darken_raster(w->open.sizes + r);
+    for (int i = 0; i < list->cluster_count; ++i)
+        if (with_hidden || !is_hidden(f, list->clusters[i]))
+            add_cluster(f, list->clusters[i], ALL_GROUPS, &w->open);
+    light_rows(w->open.sizes, 0, 0);
+    gather_sizes(&w->open);
 }

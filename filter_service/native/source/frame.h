@@ -25,11 +25,15 @@ typedef struct {
  * pixels of 2^r px, whose light is interpolated between their centers. */
 #define RESOLUTIONS 3
 
+/* Texels of zeros between the rows of a kernel: a fragment is added to columns of eight pixels
+ * that its kernel may only touch. */
+#define ROW_GAP_TEXELS 7
+
 /* A kernel for fragments of one level: texels of four pairs (red, green, blue, mean) of
  * 15-bit weights at the near and far end.  weight = scale * (near * (1 - f) + far * f),
  * with the fraction f of the interval. */
 typedef struct {
-    uint32_t first_texel;     /* of row 0; a texel of zeros lies before and after a row */
+    uint32_t first_texel;     /* of row 0; ROW_GAP_TEXELS zeros lie before and after a row */
     int32_t resolution;
     int16_t left, up;         /* of its first texel from that of the fragment's square */
     int16_t width, height;
@@ -46,8 +50,9 @@ typedef struct { level_image level[MAX_LEVEL + 1]; } kernel_image;
 typedef struct {
     uint16_t x, y;            /* first pixel */
     uint32_t state;           /* kernel | level << LEVEL_SHIFT | EDGE_BIT | SPECIAL_BIT */
-    uint16_t fraction;        /* of the kernel's interval, in parts of 65535 */
-    uint16_t radius_px;
+    /* Of the kernel's interval, in parts of 65535; once kernels are blended, the shares of
+     * their near and far ends (set_factors). */
+    uint32_t fraction;
 } fragment;
 
 typedef struct {
@@ -62,6 +67,16 @@ typedef struct {
     float excess;             /* light that coverage does not amplify */
 } fragment_extra;
 
+/* Consecutive fragments of one block with the same kernel and level, in scan order. */
+typedef struct {
+    uint32_t first, count;    /* of its fragments */
+    uint32_t state;           /* as of a fragment; EDGE_BIT and SPECIAL_BIT if one has them */
+    float nearest, farthest;  /* least and largest sort depth */
+    uint16_t left, right, top, bottom;       /* its pixels */
+    uint16_t radius_px;
+    uint16_t spare;
+} cluster;
+
 enum { BOX_LEFT, BOX_RIGHT, BOX_TOP, BOX_BOTTOM };
 
 #define LEVEL_SHIFT 28
@@ -69,9 +84,10 @@ enum { BOX_LEFT, BOX_RIGHT, BOX_TOP, BOX_BOTTOM };
 #define EDGE_BIT 0x40000000u
 #define SPECIAL_BIT 0x80000000u
 
-/* A block of 8 x 8 pixels; its fragments follow those of the block to its left. */
+/* A block of 8 x 8 pixels; its fragments and clusters follow those of the block to its left. */
 typedef struct {
     uint32_t first, end;      /* of its fragments */
+    uint32_t first_cluster, end_cluster;
     uint16_t radius_px;       /* largest of its fragments */
     uint8_t has_edge;
     uint8_t merged;           /* pixels that are part of squares */
@@ -150,7 +166,8 @@ typedef struct {
     fragment_light *lights;
     fragment_extra *extras;
     float *blend_shares;      /* of each fragment; NULL if pixels do not blend cells */
-    int16_t *boxes[4];        /* first and last columns and rows that fragments light */
+    cluster *clusters;        /* at most as many as fragments; no gaps in a row of blocks */
+    int16_t *boxes[4];        /* first and last columns and rows that clusters light */
     block_info *blocks;
     int64_t fragment_count, merged_count;
     int32_t farthest_px;      /* largest radius of a fragment */

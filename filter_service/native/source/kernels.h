@@ -10,9 +10,12 @@
 
 INLINE int level_extent(int level) { return (1 << level) - 1; }
 
+/* Texels from one row of a kernel to the next. */
+INLINE int row_texels(const level_image *image) { return image->width + ROW_GAP_TEXELS; }
+
 /* Lays out the levels of all kernels that fragments use, consecutively. */
 static void place_kernels(frame *f) {
-    uint64_t texel = 1;
+    uint64_t texel = ROW_GAP_TEXELS;
     uint64_t largest = 0;
     for (int k = 0; k < f->kernel_count; ++k) {
         const kernel_shape *shape = f->shapes + k;
@@ -36,19 +39,22 @@ static void place_kernels(frame *f) {
             image->width = (int16_t)(reach_width(boxes[r]) + beyond);
             image->height = (int16_t)(reach_height(boxes[r]) + beyond);
             image->first_texel = (uint32_t)texel;
-            uint64_t texels = (uint64_t)(image->width + 1) * (uint64_t)image->height;
+            uint64_t texels = (uint64_t)row_texels(image) * (uint64_t)image->height;
             texel += texels;
             largest = texels > largest ? texels : largest;
         }
     }
-    f->kernel_texel_count = texel + 1;
+    f->kernel_texel_count = texel;
     /* both ends of a kernel at all levels, four floats per texel */
     uint64_t floats = 2 * (MAX_LEVEL + 1) * 4 * (largest + 64);
     if (floats > f->blend_scratch_floats) f->blend_scratch_floats = floats;
 }
 
 INLINE i32x4 steps_of(f32x4 texel, f32x4 per_light, float added) {
-    return __builtin_convertvector(texel * per_light + all4(added), i32x4);
+    f32x4 steps = texel * per_light + all4(added);
+    i32x4 whole = __builtin_convertvector(steps, i32x4);
+    /* rounds down, also the negative texels of coarse kernels */
+    return whole + (__builtin_convertvector(whole, f32x4) > steps);
 }
 
 /* Writes one row of a kernel: near ends in the low halves, far ends in the high ones. */
@@ -65,7 +71,7 @@ INLINE void write_row(const kernel_end *end, int level, int y, const level_image
         i32x4 steps = steps_of(load4(from + 4 * x), per_light, added[(x - end->box.left) & 3]);
         i32x4 texel;
         memcpy(&texel, to + 4 * x, sizeof texel);
-        texel |= is_far ? steps << 16 : steps;
+        texel |= is_far ? steps << 16 : steps & 0xFFFF;
         memcpy(to + 4 * x, &texel, sizeof texel);
     }
 }
@@ -82,9 +88,9 @@ static void write_level(const frame *f, level_image *image, int own, kernel_end 
     f32x4 near_steps = all4(near > 0.0f ? STEPS_15_BITS / near : 0.0f);
     f32x4 far_steps = all4(far > 0.0f ? STEPS_15_BITS / far : 0.0f);
     uint32_t *row = f->kernel_texels + 4 * (size_t)image->first_texel;
-    memset(row - 4, 0, 16);
-    for (int y = 0; y < image->height; ++y, row += 4 * (image->width + 1)) {
-        memset(row, 0, 16 * (size_t)(image->width + 1));
+    memset(row - 4 * ROW_GAP_TEXELS, 0, 16 * ROW_GAP_TEXELS);
+    for (int y = 0; y < image->height; ++y, row += 4 * row_texels(image)) {
+        memset(row, 0, 16 * (size_t)row_texels(image));
         write_row(ends[0], own, y, image, 0, near_steps, row);
         write_row(ends[1], own, y, image, 1, far_steps, row);
     }

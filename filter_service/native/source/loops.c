@@ -13,6 +13,7 @@ EXPORT void ocu_sizes(int32_t *sizes) {
     sizes[n++] = (int32_t)sizeof(frame);
     sizes[n++] = (int32_t)sizeof(fragment);
     sizes[n++] = (int32_t)sizeof(block_info);
+    sizes[n++] = (int32_t)sizeof(cluster);
     sizes[n++] = (int32_t)sizeof(kernel_shape);
     sizes[n++] = (int32_t)sizeof(kernel_image);
     sizes[n++] = (int32_t)sizeof(recipe_image);

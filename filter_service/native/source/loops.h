@@ -66,6 +66,7 @@ static void splat(frame *f) {
         f->failed = 1;
         return;
     }
+    pool_run(f->threads, f->surface_count * f->block_rows, set_factors, f);
     pool_run(f->threads, job.columns * job.rows, splat_bin, &job);
     for (int thread = 0; thread < n_threads; ++thread) free_list(job.lists + thread);
     free(job.lists);

@@ -31,20 +31,22 @@ INLINE int has_excess(const pixel_pair *sums) {
 typedef struct {
     int x0, y0, width, height;  /* in their own size */
     int stride;                 /* pairs from row to row */
-    int is_lit;                 /* otherwise its sums are not set */
+    int is_set;                 /* all sums outside the lit rows are zero; otherwise not set */
+    int top, bottom;            /* lit rows: the first, and the last plus one */
     pixel_pair *pairs;
 } raster;
 
 /* Light of one group of depths in each size. */
 typedef struct { raster sizes[RESOLUTIONS]; } depth_group;
 
-/* Pixels of a bin or a tile, in rows of PAIRS_ACROSS. */
+/* Pixels of a bin, in rows of PAIRS_ACROSS. */
 typedef struct {
     int x0, y0, width, height;
-    depth_group open[2];        /* two consecutive groups; without order, only the first */
+    depth_group open;           /* the nearest group that is not closed, or all light */
     pixel_pair *near;           /* light of closed groups, each behind those before it */
     pixel_pair *total;          /* light of closed groups, regardless of order */
-    int has_hidden;             /* whether it includes light of a hidden surface */
+    float least[BIN_HEIGHT];    /* coverage of near of each row, of any color */
+    float least_strength[BIN_HEIGHT];  /* of edges, of total */
 } window;
 
 INLINE void clear_pairs(pixel_pair *pairs, int stride, int width, int height) {
@@ -52,18 +54,28 @@ INLINE void clear_pairs(pixel_pair *pairs, int stride, int width, int height) {
         memset(pairs + y * stride, 0, sizeof *pairs * (size_t)(width / 2));
 }
 
-static __attribute__((noinline)) void begin_raster(raster *own) {
+static __attribute__((noinline)) void clear_raster(raster *own) {
     clear_pairs(own->pairs, own->stride, own->width, own->height);
-    own->is_lit = 1;
+    own->is_set = 1;
 }
 
-/* Clears a raster to which nothing has been added.  That is rare: inlined, it takes registers
- * from the loop over fragments. */
-INLINE void light_raster(raster *own) {
-    if (__builtin_expect(!own->is_lit, 0)) begin_raster(own);
+/* Prepares rows of a raster to which light is added. */
+INLINE void light_rows(raster *own, int top, int bottom) {
+    if (__builtin_expect(!own->is_set, 0)) clear_raster(own);
+    own->top = smaller_int(own->top, larger_int(top, 0));
+    own->bottom = larger_int(own->bottom, smaller_int(bottom, own->height));
 }
 
-/* Sums of a group of depths in all sizes; a tile uses the first elements of each. */
+/* Removes all light. */
+INLINE void darken_raster(raster *own) {
+    int rows = own->bottom - own->top;
+    if (rows > 0)
+        clear_pairs(own->pairs + own->top * own->stride, own->stride, own->width, rows);
+    own->top = own->height;
+    own->bottom = 0;
+}
+
+/* Sums of a group of depths in all sizes. */
 typedef struct {
     pixel_pair whole[BIN_HEIGHT * PAIRS_ACROSS];
     pixel_pair half[(BIN_HEIGHT / 2 + 2) * (PAIRS_ACROSS / 2 + 1)];
@@ -74,29 +86,28 @@ typedef struct {
 typedef struct {
     pixel_pair near[BIN_HEIGHT * PAIRS_ACROSS];
     pixel_pair total[BIN_HEIGHT * PAIRS_ACROSS];
-    group_sums open[2];
+    group_sums open;
 } bin_sums;
 
-INLINE depth_group open_group(int x0, int y0, int width, int height, group_sums *s) {
-    depth_group group = {{{x0, y0, width, height, PAIRS_ACROSS, 0, s->whole}}};
-    pixel_pair *coarse[RESOLUTIONS] = {s->whole, s->half, s->quarter};
-    for (int r = 1; r < RESOLUTIONS; ++r)
-        group.sizes[r] = (raster){(x0 >> r) - 1, (y0 >> r) - 1, (width >> r) + 2,
-                                  (height >> r) + 2, ((width >> r) + 2) / 2, 0, coarse[r]};
-    return group;
-}
-
-/* Opens a window with one group of depths. */
-INLINE window open_window(int x0, int y0, int width, int height, bin_sums *s) {
-    window w = {.x0 = x0, .y0 = y0, .width = width, .height = height,
+/* Opens a window on a bin. */
+INLINE window open_window(int x0, int y0, bin_sums *s) {
+    window w = {.x0 = x0, .y0 = y0, .width = BIN_WIDTH, .height = BIN_HEIGHT,
                 .near = s->near, .total = s->total};
-    w.open[0] = open_group(x0, y0, width, height, s->open);
+    pixel_pair *sums[RESOLUTIONS] = {s->open.whole, s->open.half, s->open.quarter};
+    w.open.sizes[0] = (raster){x0, y0, BIN_WIDTH, BIN_HEIGHT, PAIRS_ACROSS, 0,
+                                BIN_HEIGHT, 0, sums[0]};
+    for (int r = 1; r < RESOLUTIONS; ++r) {
+        int width = (BIN_WIDTH >> r) + 2, height = (BIN_HEIGHT >> r) + 2;
+        w.open.sizes[r] = (raster){(x0 >> r) - 1, (y0 >> r) - 1, width, height, width / 2, 0,
+                                   height, 0, sums[r]};
+    }
     return w;
 }
 
 /* Prepares a window for groups of depths in order. */
-INLINE void open_order(window *w, bin_sums *s) {
-    w->open[1] = open_group(w->x0, w->y0, w->width, w->height, s->open + 1);
+INLINE void open_order(window *w) {
     clear_pairs(w->near, PAIRS_ACROSS, w->width, w->height);
     clear_pairs(w->total, PAIRS_ACROSS, w->width, w->height);
+    memset(w->least, 0, sizeof w->least);
+    memset(w->least_strength, 0, sizeof w->least_strength);
 }
