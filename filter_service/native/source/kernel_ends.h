@@ -19,6 +19,25 @@ typedef struct {
     float largest[MAX_LEVEL + 1];
 } kernel_end;
 
+INLINE int level_extent(int level) { return (1 << level) - 1; }
+INLINE int level_width(const kernel_end *end, int level) {
+    return reach_width(end->box) + level_extent(level);
+}
+INLINE int level_height(const kernel_end *end, int level) {
+    return reach_height(end->box) + level_extent(level);
+}
+
+/* Texels from row to row of a level: an even number.  Those beyond its width are zeros, which
+ * the sums of the next level read. */
+INLINE int level_stride(const kernel_end *end, int level) {
+    int zeros = level < MAX_LEVEL ? 1 << level : 0;
+    return (level_width(end, level) + zeros + 1) & ~1;
+}
+
+/* Texels before a level, of which the zeros of its row 0 are part. */
+#define LEVEL_LEAD 8
+#define LEVEL_PAD 6                /* the most that a stride exceeds the width by */
+
 /* Reach in image pixels of a kernel stored in other pixels; twin: cell_maps.mapped_reach. */
 static reach mapped_reach(const double *map, reach stored) {
     double area = map[0] * map[3] - map[1] * map[2];
@@ -74,12 +93,13 @@ INLINE void find_covered(float start, float step, float half, int count, int n_t
 /* Adds a mapped part: each pixel takes the light of the stored ones that it covers.  n_taps
  * is 2 or 3; the compiler generates a loop for each. */
 INLINE void add_mapped_taps(const float *texels, int stride, reach stored, const float *map,
-                            float weight, reach box, int n_taps, float *to) {
+                            float weight, reach box, int n_taps, float *to,
+                            int to_stride) {
     float half_x = 0.5f * fabsf(map[0]);
     float half_y = 0.5f * fabsf(map[3]);
     int width = reach_width(box);
     row_reads across, along;
-    for (int y = -box.up; y <= box.down; ++y, to += 4 * width) {
+    for (int y = -box.up; y <= box.down; ++y, to += 4 * to_stride) {
         float x = (float)-box.left;
         find_covered(map[0] * x + map[1] * (float)y, map[0], half_x, width, n_taps,
                      -stored.left - n_taps, stored.right + 1, &across);
@@ -118,10 +138,10 @@ INLINE float share_of(float low, float high, int texel) {
  * pixels of a cell and a node differ that much in fields of 90 degrees.  Reads only within
  * the kernel. */
 static void add_mapped_wide(const float *texels, int stride, reach stored, const float *map,
-                            float weight, reach box, float *to) {
+                            float weight, reach box, float *to, int to_stride) {
     float half_x = 0.5f * fabsf(map[0]);
     float half_y = 0.5f * fabsf(map[3]);
-    for (int y = -box.up; y <= box.down; ++y)
+    for (int y = -box.up; y <= box.down; ++y, to += 4 * (to_stride - reach_width(box)))
         for (int x = -box.left; x <= box.right; ++x, to += 4) {
             float middle_x = map[0] * (float)x + map[1] * (float)y;
             float middle_y = map[2] * (float)x + map[3] * (float)y;
@@ -144,34 +164,36 @@ static void add_mapped_wide(const float *texels, int stride, reach stored, const
 }
 
 static void add_mapped(const frame *f, const recipe_image *image, const double *map,
-                       float weight, reach box, float *to) {
+                       float weight, reach box, float *to, int to_stride) {
     const float *texels = f->recipe_texels + 4 * image->first_texel;
     reach stored = read_reach(image->reach_px);
     float own[4] = {(float)map[0], (float)map[1], (float)map[2], (float)map[3]};
     float side = larger_float(fabsf(own[0]), fabsf(own[3]));
-    if (side <= 1.0f) add_mapped_taps(texels, image->stride, stored, own, weight, box, 2, to);
+    int stride = image->stride;
+    if (side <= 1.0f)
+        add_mapped_taps(texels, stride, stored, own, weight, box, 2, to, to_stride);
     else if (side < 2.0f)
-        add_mapped_taps(texels, image->stride, stored, own, weight, box, 3, to);
+        add_mapped_taps(texels, stride, stored, own, weight, box, 3, to, to_stride);
     else
-        add_mapped_wide(texels, image->stride, stored, own, weight, box, to);
+        add_mapped_wide(texels, stride, stored, own, weight, box, to, to_stride);
 }
 
+/* Adds a part to rows of an even number of texels.  The texel beyond an odd width is zero. */
 static void add_unmoved(const frame *f, const recipe_image *image, float weight, reach box,
-                        float *to) {
+                        float *to, int to_stride) {
     reach stored = read_reach(image->reach_px);
     const float *from = f->recipe_texels + 4 * image->first_texel;
-    int width = reach_width(box);
     int count = 4 * reach_width(stored);
-    to += 4 * ((box.up - stored.up) * width + box.left - stored.left);
-    for (int y = 0; y < reach_height(stored); ++y, to += 4 * width, from += 4 * image->stride)
-        for (int x = 0; x < count; x += 4)
-            store4(to + x, load4(to + x) + load4(from + x) * all4(weight));
+    to += 4 * ((box.up - stored.up) * to_stride + box.left - stored.left);
+    for (int y = 0; y < reach_height(stored); ++y, to += 4 * to_stride, from += 4 * image->stride)
+        for (int x = 0; x < count; x += 8)
+            store8(to + x, load8(to + x) + load8(from + x) * all8(weight));
 }
 
-static float largest_of(const float *texels, size_t count) {
-    f32x4 most = all4(0.0f);
-    for (size_t i = 0; i < count; ++i) most = larger4(load4(texels + 4 * i), most);
-    return larger_float(most[0], larger_float(most[1], most[2]));
+/* Largest of red, green and blue of two texels. */
+INLINE float largest_color(f32x8 two) {
+    float even = larger_float(two[0], larger_float(two[1], two[2]));
+    return larger_float(even, larger_float(two[4], larger_float(two[5], two[6])));
 }
 
 /* Box of a kernel's end: the union of the boxes of its mapped parts. */
@@ -200,37 +222,49 @@ static void make_end(const frame *f, int kernel, int is_far, int r, kernel_end *
     memcpy(end->recipes, recipes, sizeof recipes);
     memcpy(end->maps, maps, sizeof end->maps);
     reach box = end->box = end_box(f, kernel, is_far, recipes, r);
-    size_t count = (size_t)reach_width(box) * (size_t)reach_height(box);
-    memset(end->texels[0], 0, sizeof(float) * 4 * count);
+    int stride = level_stride(end, 0);
+    size_t count = 4 * (size_t)stride * (size_t)reach_height(box);
+    float *to = end->texels[0];
+    memset(to - 4 * LEVEL_LEAD, 0, sizeof(float) * (count + 4 * LEVEL_LEAD));
     for (int j = 0; j < FIELD_CORNERS; ++j) {
         if (recipes[j] < 0) continue;
         const recipe_image *image = f->recipe_images + RESOLUTIONS * recipes[j] + r;
         float weight = (float)weights[j];
-        if (is_unmoved(maps + 4 * j)) add_unmoved(f, image, weight, box, end->texels[0]);
-        else add_mapped(f, image, maps + 4 * j, weight, box, end->texels[0]);
+        if (is_unmoved(maps + 4 * j)) add_unmoved(f, image, weight, box, to, stride);
+        else add_mapped(f, image, maps + 4 * j, weight, box, to, stride);
     }
-    end->largest[0] = largest_of(end->texels[0], count);
+    f32x8 most = all8(0.0f);
+    for (size_t i = 0; i < count; i += 8) most = larger8(load8(to + i), most);
+    end->largest[0] = largest_color(most);
     end->level_count = 1;
 }
+
+/* A row outside a level. */
+static const float no_texels[4 * (LEVEL_LEAD + LONGEST_ROW + 2 * LEVEL_LEAD)];
 
 /* Computes sums of the level below over 2 x 2 squares, up to a level. */
 static void make_levels(kernel_end *end, int level) {
     for (; end->level_count <= level; ++end->level_count) {
-        int step = 1 << (end->level_count - 1);
-        int width = reach_width(end->box) + step - 1;
-        int height = reach_height(end->box) + step - 1;
-        int wide = width + step;
-        const float *from = end->texels[end->level_count - 1];
-        float *to = end->texels[end->level_count];
-        size_t count = (size_t)wide * (size_t)(height + step);
-        memset(to, 0, sizeof(float) * 4 * count);
-        for (int y = 0; y < height; ++y, from += 4 * width) {
-            for (int corner = 0; corner < 4; ++corner) {
-                float *row = to + 4 * ((y + step * (corner >> 1)) * wide + step * (corner & 1));
-                for (int x = 0; x < 4 * width; x += 4)
-                    store4(row + x, load4(row + x) + load4(from + x));
+        int own = end->level_count;
+        int step = 1 << (own - 1);
+        int width = level_width(end, own), height = level_height(end, own);
+        int stride = level_stride(end, own), from_stride = level_stride(end, own - 1);
+        const float *from = end->texels[own - 1], *outside = no_texels + 4 * LEVEL_LEAD;
+        float *to = end->texels[own];
+        memset(to - 4 * LEVEL_LEAD, 0, sizeof(float) * 4 * LEVEL_LEAD);
+        f32x8 most = all8(0.0f);
+        for (int y = 0; y < height; ++y, to += 4 * stride) {
+            const float *above = y < step ? outside : from + 4 * (y - step) * from_stride;
+            const float *here = y < height - step ? from + 4 * y * from_stride : outside;
+            int x = 0;
+            for (; x < 4 * width; x += 8) {
+                f32x8 sum = load8(above + x) + load8(above + x - 4 * step)
+                            + load8(here + x) + load8(here + x - 4 * step);
+                most = larger8(sum, most);
+                store8(to + x, sum);
             }
+            for (; x < 4 * stride; x += 8) store8(to + x, all8(0.0f));
         }
-        end->largest[end->level_count] = largest_of(to, count);
+        end->largest[own] = largest_color(most);
     }
 }

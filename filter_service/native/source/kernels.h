@@ -8,8 +8,6 @@
 
 #define STEPS_15_BITS 32767.0f
 
-INLINE int level_extent(int level) { return (1 << level) - 1; }
-
 /* Texels from one row of a kernel to the next. */
 INLINE int row_texels(const level_image *image) { return image->width + ROW_GAP_TEXELS; }
 
@@ -41,6 +39,7 @@ static void place_kernels(frame *f) {
             image->first_texel = (uint32_t)texel;
             uint64_t texels = (uint64_t)row_texels(image) * (uint64_t)image->height;
             texel += texels;
+            texels += LEVEL_PAD * (uint64_t)image->height;
             largest = texels > largest ? texels : largest;
         }
     }
@@ -50,30 +49,73 @@ static void place_kernels(frame *f) {
     if (floats > f->blend_scratch_floats) f->blend_scratch_floats = floats;
 }
 
-INLINE i32x4 steps_of(f32x4 texel, f32x4 per_light, float added) {
-    f32x4 steps = texel * per_light + all4(added);
-    i32x4 whole = __builtin_convertvector(steps, i32x4);
+INLINE i32x8 steps_of(f32x8 texels, f32x8 per_light, f32x8 added) {
+    f32x8 steps = texels * per_light + added;
+    i32x8 whole = __builtin_convertvector(steps, i32x8);
     /* rounds down, also the negative texels of coarse kernels */
-    return whole + (__builtin_convertvector(whole, f32x4) > steps);
+    return whole + (__builtin_convertvector(whole, f32x8) > steps);
 }
 
-/* Writes one row of a kernel: near ends in the low halves, far ends in the high ones. */
-INLINE void write_row(const kernel_end *end, int level, int y, const level_image *image,
-                      int is_far, f32x4 per_light, uint32_t *to) {
+INLINE f32x8 of_texels(float first, float second) {
+    return (f32x8){first, first, first, first, second, second, second, second};
+}
+
+/* A level of an end within a row of the kernel: its texels and its first and last column. */
+typedef struct {
+    const float *texels;           /* of column 0 of the kernel */
+    int first, end;
+} end_row;
+
+INLINE end_row row_of_end(const kernel_end *end, int level, int y, const level_image *image) {
     int from_y = y - (image->up - end->box.up);
-    int width = reach_width(end->box) + level_extent(level);
-    int height = reach_height(end->box) + level_extent(level);
-    if (from_y < 0 || from_y >= height) return;
-    const float *from = end->texels[level] + 4 * (size_t)from_y * (size_t)width;
-    to += 4 * (image->left - end->box.left);
-    const float *added = before_next_cut[(y - image->up) & 3];
-    for (int x = 0; x < width; ++x) {
-        i32x4 steps = steps_of(load4(from + 4 * x), per_light, added[(x - end->box.left) & 3]);
-        i32x4 texel;
-        memcpy(&texel, to + 4 * x, sizeof texel);
-        texel |= is_far ? steps << 16 : steps & 0xFFFF;
-        memcpy(to + 4 * x, &texel, sizeof texel);
+    if (from_y < 0 || from_y >= level_height(end, level))
+        return (end_row){no_texels, 0, image->width};
+    int first = image->left - end->box.left;
+    const float *texels = end->texels[level] + 4 * from_y * level_stride(end, level);
+    return (end_row){texels - 4 * first, first, first + level_width(end, level)};
+}
+
+/* Steps per light of both ends, and the dither of the row. */
+typedef struct { f32x8 near, far; const float *added; } step_sizes;
+
+/* Writes texels of a row: near ends in the low halves, far ends in the high ones.  `column` is
+ * that of the first one from the center of the kernel. */
+INLINE void write_texels(const float *near, const float *far, step_sizes steps, int column,
+                         int count, uint32_t *to) {
+    const float *added = steps.added;
+    int c = column & 3;
+    f32x8 here = of_texels(added[c], added[(c + 1) & 3]);
+    f32x8 next = of_texels(added[c ^ 2], added[(c + 3) & 3]);
+    int x = 0;
+    for (; x + 8 <= count; x += 8) {
+        i32x8 texels = (steps_of(load8(near + x), steps.near, here) & 0xFFFF)
+                       | steps_of(load8(far + x), steps.far, here) << 16;
+        memcpy(to + x, &texels, sizeof texels);
+        f32x8 last = here;
+        here = next;
+        next = last;
     }
+    if (x == count) return;
+    i32x8 texels = (steps_of(twice4(load4(near + x)), steps.near, here) & 0xFFFF)
+                   | steps_of(twice4(load4(far + x)), steps.far, here) << 16;
+    memcpy(to + x, &texels, sizeof texels / 2);
+}
+
+/* Writes one row of a kernel, and the zeros behind it. */
+INLINE void write_row(const level_image *image, end_row near, end_row far, step_sizes steps,
+                      uint32_t *to) {
+    int first = larger_int(near.first, far.first), end = smaller_int(near.end, far.end);
+    int column = -image->left, width = image->width;
+    if (first > 0)
+        write_texels(near.first ? no_texels : near.texels, far.first ? no_texels : far.texels,
+                     steps, column, 4 * first, to);
+    write_texels(near.texels + 4 * first, far.texels + 4 * first, steps, column + first,
+                 4 * (end - first), to + 4 * first);
+    if (end < width)
+        write_texels(near.end == end ? no_texels : near.texels + 4 * end,
+                     far.end == end ? no_texels : far.texels + 4 * end, steps, column + end,
+                     4 * (width - end), to + 4 * end);
+    memset(to + 4 * image->width, 0, 16 * ROW_GAP_TEXELS);
 }
 
 /* Writes a kernel's level, which is level `own` of its resolution. */
@@ -85,14 +127,14 @@ static void write_level(const frame *f, level_image *image, int own, kernel_end 
     image->scale = most / (STEPS_15_BITS * STEPS_15_BITS);
     image->near_ratio = STEPS_15_BITS * near / most;
     image->far_ratio = STEPS_15_BITS * far / most;
-    f32x4 near_steps = all4(near > 0.0f ? STEPS_15_BITS / near : 0.0f);
-    f32x4 far_steps = all4(far > 0.0f ? STEPS_15_BITS / far : 0.0f);
+    step_sizes steps = {all8(near > 0.0f ? STEPS_15_BITS / near : 0.0f),
+                       all8(far > 0.0f ? STEPS_15_BITS / far : 0.0f), NULL};
     uint32_t *row = f->kernel_texels + 4 * (size_t)image->first_texel;
     memset(row - 4 * ROW_GAP_TEXELS, 0, 16 * ROW_GAP_TEXELS);
     for (int y = 0; y < image->height; ++y, row += 4 * row_texels(image)) {
-        memset(row, 0, 16 * (size_t)row_texels(image));
-        write_row(ends[0], own, y, image, 0, near_steps, row);
-        write_row(ends[1], own, y, image, 1, far_steps, row);
+        steps.added = before_next_cut[(y - image->up) & 3];
+        write_row(image, row_of_end(ends[0], own, y, image),
+                  row_of_end(ends[1], own, y, image), steps, row);
     }
 }
 
@@ -129,7 +171,8 @@ static void blend_kernels(void *argument, int item, int thread) {
     kernel_end two[2];
     for (int e = 0; e < 2; ++e)
         for (int level = 0; level <= MAX_LEVEL; ++level)
-            two[e].texels[level] = scratch + (size_t)(e * (MAX_LEVEL + 1) + level) * plane;
+            two[e].texels[level]
+                = scratch + (size_t)(e * (MAX_LEVEL + 1) + level) * plane + 4 * LEVEL_LEAD;
     int last = smaller_int((item + 1) * KERNELS_AN_ITEM, f->kernel_count);
     for (int r = 0; r < RESOLUTIONS; ++r)
         blend_some(f, item * KERNELS_AN_ITEM, last, r, two);
