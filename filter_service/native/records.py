@@ -113,6 +113,7 @@ class Frame(c.Structure):
         ("store", POINTER * RESOLUTIONS),
         ("store_first", POINTER * RESOLUTIONS),
         ("store_reach", POINTER * RESOLUTIONS),
+        ("store_words", c.c_uint64 * RESOLUTIONS),
         ("coarse_spread_px", c.c_float * RESOLUTIONS),
         ("recipes", POINTER),
         ("recipe_count", c.c_int32),

@@ -177,6 +177,7 @@ typedef struct {
     const uint16_t *store[RESOLUTIONS];
     const uint64_t *store_first[RESOLUTIONS];      /* of each cached kernel */
     const uint32_t *store_reach[RESOLUTIONS];      /* four bytes: left, right, up, down */
+    uint64_t store_words[RESOLUTIONS];             /* number of words */
     float coarse_spread_px[RESOLUTIONS];           /* smallest spread that may use it */
     const uint32_t *recipes;  /* (n, 3, 18): cached kernels, unused, weights */
     int32_t recipe_count;

@@ -196,6 +196,96 @@ INLINE float largest_color(f32x8 two) {
     return larger_float(even, larger_float(two[4], larger_float(two[5], two[6])));
 }
 
+/* Texels of a part in rows and columns of a kernel's box; columns are floats. */
+typedef struct {
+    const float *texels;           /* of column 0 in the current row */
+    int stride, first, end, top, bottom;
+    float weight;
+} part_area;
+
+/* Sums n parts between two floats that all of them have; returns the largest sums.  The
+ * compiler generates a loop for each n. */
+INLINE f32x8 sum_parts(const part_area *parts, int n, ptrdiff_t x, ptrdiff_t end, float *to,
+                       f32x8 most) {
+    for (; x + 8 <= end; x += 8) {
+        f32x8 sum = all8(0.0f);
+        for (int j = 0; j < n; ++j) sum += load8(parts[j].texels + x) * all8(parts[j].weight);
+        most = larger8(sum, most);
+        store8(to + x, sum);
+    }
+    if (x == end) return most;
+    f32x4 sum = all4(0.0f);
+    for (int j = 0; j < n; ++j) sum += load4(parts[j].texels + x) * all4(parts[j].weight);
+    store4(to + x, sum);
+    return larger8(twice4(sum), most);
+}
+
+/* Adds a part where not all parts have texels. */
+INLINE f32x8 add_part(const part_area *part, int x, int end, float *to, f32x8 most) {
+    for (; x < end; x += 4) {
+        f32x4 sum = load4(to + x) + load4(part->texels + x) * all4(part->weight);
+        store4(to + x, sum);
+        most = larger8(twice4(sum), most);
+    }
+    return most;
+}
+
+INLINE void clear_texels(float *to, int x, int end) {
+    for (; x < end; x += 4) store4(to + x, all4(0.0f));
+}
+
+/* Areas (n,) of a kernel's parts in its box. */
+INLINE int part_areas(const frame *f, const int *recipes, const double *weights, int r,
+                      reach box, part_area *areas) {
+    int n = 0;
+    for (int j = 0; j < FIELD_CORNERS; ++j) {
+        if (recipes[j] < 0) continue;
+        const recipe_image *image = f->recipe_images + RESOLUTIONS * recipes[j] + r;
+        reach stored = read_reach(image->reach_px);
+        int first = 4 * (box.left - stored.left), top = box.up - stored.up;
+        areas[n++] = (part_area){f->recipe_texels + 4 * image->first_texel - first,
+                                 4 * image->stride, first, first + 4 * reach_width(stored),
+                                 top, top + reach_height(stored), (float)weights[j]};
+    }
+    return n;
+}
+
+/* Sums parts that are not mapped; returns the largest weight. */
+static float sum_unmoved(const frame *f, const int *recipes, const double *weights, int r,
+                         reach box, float *to, int stride) {
+    part_area areas[FIELD_CORNERS], parts[FIELD_CORNERS];
+    int count = part_areas(f, recipes, weights, r, box, areas);
+    f32x8 most = all8(0.0f);
+    for (int y = 0, next; y < reach_height(box); y = next) {
+        /* rows up to `next` have the same parts */
+        int n = 0, first = 0, end = 4 * reach_width(box);
+        next = reach_height(box);
+        for (part_area *area = areas; area < areas + count; ++area) {
+            if (y < area->top) next = smaller_int(next, area->top);
+            if (y < area->top || y >= area->bottom) continue;
+            next = smaller_int(next, area->bottom);
+            first = larger_int(first, area->first);
+            end = smaller_int(end, area->end);
+            parts[n] = *area;
+            parts[n++].texels += (ptrdiff_t)(y - area->top) * area->stride;
+        }
+        if (n == 0) end = 0;
+        for (int rows = next - y; rows-- > 0; to += 4 * stride) {
+            clear_texels(to, 0, first);
+            clear_texels(to, end, 4 * stride);
+            if (n == 3) most = sum_parts(parts, 3, first, end, to, most);
+            else if (n == 2) most = sum_parts(parts, 2, first, end, to, most);
+            else if (n == 1) most = sum_parts(parts, 1, first, end, to, most);
+            for (int j = 0; j < n; ++j) {
+                most = add_part(parts + j, parts[j].first, first, to, most);
+                most = add_part(parts + j, end, parts[j].end, to, most);
+                parts[j].texels += parts[j].stride;
+            }
+        }
+    }
+    return largest_color(most);
+}
+
 /* Box of a kernel's end: the union of the boxes of its mapped parts. */
 static reach end_box(const frame *f, int kernel, int is_far, const int *recipes, int r) {
     const double *maps = f->part_maps + 4 * first_part(kernel, is_far);
@@ -206,6 +296,12 @@ static reach end_box(const frame *f, int kernel, int is_far, const int *recipes,
         box = wider(box, is_unmoved(maps + 4 * j) ? own : mapped_reach(maps + 4 * j, own));
     }
     return box;
+}
+
+INLINE int has_mapped(const int *recipes, const double *maps) {
+    for (int j = 0; j < FIELD_CORNERS; ++j)
+        if (recipes[j] >= 0 && !is_unmoved(maps + 4 * j)) return 1;
+    return 0;
 }
 
 /* Computes the kernel of a cell at one layer, unless `end` already holds it. */
@@ -225,7 +321,13 @@ static void make_end(const frame *f, int kernel, int is_far, int r, kernel_end *
     int stride = level_stride(end, 0);
     size_t count = 4 * (size_t)stride * (size_t)reach_height(box);
     float *to = end->texels[0];
-    memset(to - 4 * LEVEL_LEAD, 0, sizeof(float) * (count + 4 * LEVEL_LEAD));
+    end->level_count = 1;
+    memset(to - 4 * LEVEL_LEAD, 0, sizeof(float) * 4 * LEVEL_LEAD);
+    if (!has_mapped(recipes, maps)) {
+        end->largest[0] = sum_unmoved(f, recipes, weights, r, box, to, stride);
+        return;
+    }
+    memset(to, 0, sizeof(float) * count);
     for (int j = 0; j < FIELD_CORNERS; ++j) {
         if (recipes[j] < 0) continue;
         const recipe_image *image = f->recipe_images + RESOLUTIONS * recipes[j] + r;
@@ -236,7 +338,6 @@ static void make_end(const frame *f, int kernel, int is_far, int r, kernel_end *
     f32x8 most = all8(0.0f);
     for (size_t i = 0; i < count; i += 8) most = larger8(load8(to + i), most);
     end->largest[0] = largest_color(most);
-    end->level_count = 1;
 }
 
 /* A row outside a level. */
@@ -256,7 +357,7 @@ static void make_levels(kernel_end *end, int level) {
         for (int y = 0; y < height; ++y, to += 4 * stride) {
             const float *above = y < step ? outside : from + 4 * (y - step) * from_stride;
             const float *here = y < height - step ? from + 4 * y * from_stride : outside;
-            int x = 0;
+            ptrdiff_t x = 0;
             for (; x < 4 * width; x += 8) {
                 f32x8 sum = load8(above + x) + load8(above + x - 4 * step)
                             + load8(here + x) + load8(here + x - 4 * step);

@@ -81,12 +81,12 @@ typedef struct { f32x8 near, far; const float *added; } step_sizes;
 /* Writes texels of a row: near ends in the low halves, far ends in the high ones.  `column` is
  * that of the first one from the center of the kernel. */
 INLINE void write_texels(const float *near, const float *far, step_sizes steps, int column,
-                         int count, uint32_t *to) {
+                         ptrdiff_t count, uint32_t *to) {
     const float *added = steps.added;
     int c = column & 3;
     f32x8 here = of_texels(added[c], added[(c + 1) & 3]);
     f32x8 next = of_texels(added[c ^ 2], added[(c + 3) & 3]);
-    int x = 0;
+    ptrdiff_t x = 0;
     for (; x + 8 <= count; x += 8) {
         i32x8 texels = (steps_of(load8(near + x), steps.near, here) & 0xFFFF)
                        | steps_of(load8(far + x), steps.far, here) << 16;

@@ -53,6 +53,10 @@ static reach recipe_reach(const frame *f, int recipe, int r) {
     return (reach){all.left + beyond, all.right + beyond, all.up + beyond, all.down + beyond};
 }
 
+/* Floats from row to row of a channel of a recipe: it is converted in eights, with the zeros
+ * after it. */
+INLINE int plane_stride(reach box) { return (reach_width(box) + PAD_TEXELS + 7) & ~7; }
+
 /* Lays out recipes consecutively, in the resolutions that kernels need. */
 static void place_recipes(frame *f) {
     memset(f->recipe_images, 0, sizeof(recipe_image) * RESOLUTIONS * (size_t)f->recipe_count);
@@ -78,11 +82,11 @@ static void place_recipes(frame *f) {
         image->stride = reach_width(box) + PAD_TEXELS;
         image->first_texel = next + (uint64_t)PAD_TEXELS * (uint64_t)image->stride;
         next += (uint64_t)image->stride * (uint64_t)(reach_height(box) + 2 * PAD_TEXELS);
-        uint64_t planes = (uint64_t)(reach_width(box) + 8) * (uint64_t)(reach_height(box) + 1);
+        uint64_t planes = (uint64_t)(plane_stride(box) * (reach_height(box) + 1));
         largest = planes > largest ? planes : largest;
     }
     f->recipe_texel_count = next + PAD_TEXELS;
-    f->blend_scratch_floats = RGB * largest;
+    f->blend_scratch_floats = (RGB * largest + 15) & ~(uint64_t)15;
 }
 
 /* Adds a weighted row of quantized weights. */
@@ -97,6 +101,36 @@ INLINE void add_row(float *to, const uint16_t *from, int count, float weight) {
     for (; x < count; ++x) to[x] += weight * (float)from[x];
 }
 
+/* Masks of eight words: the mask of those from n on begins at 8 - n, that of those before n at
+ * 16 - n. */
+#define EIGHT(word) word, word, word, word, word, word, word, word
+static const uint16_t word_masks[24] = {EIGHT(0), EIGHT(0xFFFF), EIGHT(0)};
+
+INLINE void add_words(float *to, const uint16_t *from, u16x8 kept, f32x8 factor) {
+    u16x8 words;
+    memcpy(&words, from, sizeof words);
+    store8(to, load8(to) + factor * floats_of(words & kept));
+}
+
+/* Adds weighted rows of quantized weights in eights of which the first `lead` words and those
+ * from `end` on are outside of the row: all taps add to the same eights, so that a load never
+ * waits for two stores. */
+static void add_rows_of_words(float *to, int stride, const uint16_t *from, int width,
+                              int height, int lead, float weight) {
+    f32x8 factor = all8(weight);
+    int last = (lead + width - 1) & ~7;
+    u16x8 first_kept, last_kept;
+    memcpy(&first_kept, word_masks + 8 - lead, sizeof first_kept);
+    memcpy(&last_kept, word_masks + 16 - (lead + width - last), sizeof last_kept);
+    if (last == 0) first_kept &= last_kept;
+    u16x8 all_kept = ~(u16x8){0};
+    for (from -= lead; height-- > 0; from += width, to += stride) {
+        add_words(to, from, first_kept, factor);
+        for (ptrdiff_t x = 8; x < last; x += 8) add_words(to + x, from + x, all_kept, factor);
+        if (last > 0) add_words(to + last, from + last, last_kept, factor);
+    }
+}
+
 /* Blends one channel of a recipe into a plane of rows of `stride` floats. */
 static void blend_channel(const frame *f, const uint32_t *words, int r, reach box, int stride,
                           float *plane) {
@@ -106,11 +140,17 @@ static void blend_channel(const frame *f, const uint32_t *words, int r, reach bo
         float weight = pixels * float_of(words[2 * RECIPE_TAPS + tap]);
         if (!(weight > 0.0f)) continue;
         reach own = unpack_reach(f->store_reach[r][words[tap]]);
-        const uint16_t *from = f->store[r] + f->store_first[r][words[tap]];
-        int width = reach_width(own);
-        float *to = plane + (box.up - own.up) * stride + box.left - own.left;
-        for (int y = 0; y < reach_height(own); ++y)
-            add_row(to + y * stride, from + y * width, width, weight);
+        uint64_t at = f->store_first[r][words[tap]];
+        const uint16_t *from = f->store[r] + at;
+        int width = reach_width(own), height = reach_height(own);
+        int column = box.left - own.left, lead = column & 7;
+        float *to = plane + (box.up - own.up) * stride + column;
+        uint64_t end = at + (uint64_t)(width * height);
+        if (at >= 8 && end + 8 <= f->store_words[r])
+            add_rows_of_words(to - lead, stride, from, width, height, lead, weight);
+        else /* the eights would read beyond the store */
+            for (int y = 0; y < height; ++y)
+                add_row(to + y * stride, from + y * width, width, weight);
     }
 }
 
@@ -137,8 +177,22 @@ static void sharpen(float *plane, int width, int height, int stride, float share
     }
 }
 
-INLINE f32x4 with_mean(float red, float green, float blue) {
-    return (f32x4){red, green, blue, (red + green + blue) * (1.0f / 3.0f)};
+/* Writes eight texels: red, green, blue and their mean. */
+INLINE void write_colors(f32x8 red, f32x8 green, f32x8 blue, float *to) {
+    f32x8 mean = (red + green + blue) * all8(1.0f / 3.0f);
+    f32x8 rg_low = MIXED(red, green, 0, 8, 1, 9, 4, 12, 5, 13);
+    f32x8 rg_high = MIXED(red, green, 2, 10, 3, 11, 6, 14, 7, 15);
+    f32x8 bm_low = MIXED(blue, mean, 0, 8, 1, 9, 4, 12, 5, 13);
+    f32x8 bm_high = MIXED(blue, mean, 2, 10, 3, 11, 6, 14, 7, 15);
+    /* texels 0 and 4, 1 and 5, 2 and 6, 3 and 7 */
+    f32x8 first = MIXED(rg_low, bm_low, 0, 1, 8, 9, 4, 5, 12, 13);
+    f32x8 second = MIXED(rg_low, bm_low, 2, 3, 10, 11, 6, 7, 14, 15);
+    f32x8 third = MIXED(rg_high, bm_high, 0, 1, 8, 9, 4, 5, 12, 13);
+    f32x8 fourth = MIXED(rg_high, bm_high, 2, 3, 10, 11, 6, 7, 14, 15);
+    store8(to, MIXED(first, second, 0, 1, 2, 3, 8, 9, 10, 11));
+    store8(to + 8, MIXED(third, fourth, 0, 1, 2, 3, 8, 9, 10, 11));
+    store8(to + 16, MIXED(first, second, 4, 5, 6, 7, 12, 13, 14, 15));
+    store8(to + 24, MIXED(third, fourth, 4, 5, 6, 7, 12, 13, 14, 15));
 }
 
 /* Item of the first loop: blends one recipe in one resolution. */
@@ -150,7 +204,7 @@ static void blend_recipe(void *argument, int item, int thread) {
     reach box = read_reach(image->reach_px);
     int width = reach_width(box);
     int height = reach_height(box);
-    int stride = width + 8;
+    int stride = plane_stride(box);
     size_t plane = (size_t)stride * (size_t)height;
     float *scratch = f->blend_scratch + (size_t)thread * f->blend_scratch_floats;
     for (int channel = 0; channel < RGB; ++channel)
@@ -165,10 +219,10 @@ static void blend_recipe(void *argument, int item, int thread) {
     memset(row - pad / sizeof(float), 0, pad);
     for (int y = 0; y < height; ++y, row += 4 * image->stride) {
         const float *red = scratch + (size_t)y * (size_t)stride;
-        for (int x = 0; x < width; ++x)
-            store4(row + 4 * x, with_mean(red[x], red[plane + (size_t)x],
-                                          red[2 * plane + (size_t)x]));
-        memset(row + 4 * width, 0, sizeof(float) * 4 * PAD_TEXELS);
+        /* Texels beyond the zeros after the row are written again with the next row. */
+        for (int x = 0; x < width + PAD_TEXELS; x += 8)
+            write_colors(load8(red + x), load8(red + plane + x), load8(red + 2 * plane + x),
+                         row + 4 * x);
     }
     memset(row, 0, sizeof(float) * 4 * PAD_TEXELS * (size_t)image->stride);
 }

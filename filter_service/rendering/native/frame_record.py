@@ -499,6 +499,7 @@ class FrameRecord:
             self.c.store[r] = self._pointer_to(stored.words)
             self.c.store_first[r] = self._pointer_to(stored.first_texel)
             self.c.store_reach[r] = self._pointer_to(stored.reach)
+            self.c.store_words[r] = stored.words.size
 
     def set_blend_buffers(self, sizes: BlendSizes) -> None:
         """Set pointers to buffers for blended kernels, or with such kernels."""
