@@ -29,7 +29,7 @@ from filter_service.messages import (
     Unshare,
     encode,
 )
-from filter_service.shared_memory import PAGE_BYTES, Slot, aligned_starts
+from filter_service.shared_memory import PAGE_BYTES, Slot, address_of, aligned_starts
 
 SEND_LIMIT_S = 1.0
 REPLY_LIMIT_S = 5.0
@@ -173,12 +173,14 @@ class SharedMemory:
 
     def holding(self, images: Sequence[NDArray[Any]]) -> ClientSlot | None:
         """Return the slot that already contains the images at the expected offsets."""
+        if not all(image.flags.c_contiguous for image in images):
+            return None
         starts, _ = aligned_starts([image.nbytes for image in images])
+        addresses = [address_of(image) for image in images]
         for held in self._slots:
-            base = held.slot.array(0, (1,), np.dtype(np.uint8)).ctypes.data
             if all(
-                image.ctypes.data == base + start and image.flags.c_contiguous
-                for image, start in zip(images, starts, strict=True)
+                address == held.slot.address + start
+                for address, start in zip(addresses, starts, strict=True)
             ):
                 return held
         return None

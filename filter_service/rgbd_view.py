@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -91,7 +92,7 @@ class RgbdView:
             )
         if self.hidden_color is not None or self.hidden_depth_m is not None:
             self._check_hidden()
-        object.__setattr__(self, "tangents", self.camera.tangents)
+        object.__setattr__(self, "tangents", self.camera.tangents)  # as floats
 
     def _check_hidden(self) -> None:
         """Reject a hidden layer whose types or shapes differ from the visible one's."""
@@ -107,9 +108,9 @@ class RgbdView:
             if found != wanted:
                 raise BadMessage(f"it is {found}", field=field, allowed=wanted)
 
-    @property
+    @cached_property
     def camera(self) -> Camera:
-        """Return the camera of this view."""
+        """The camera of this view."""
         return Camera(self.width_px, self.height_px, self.tangents)
 
     @property

@@ -8,6 +8,7 @@ The system frees it when no process has it open.
 from __future__ import annotations
 
 import fcntl
+import math
 import mmap
 import os
 from collections.abc import Callable, Iterator, Sequence
@@ -36,6 +37,11 @@ def aligned_starts(sizes: Sequence[int]) -> tuple[list[int], int]:
     return starts, end
 
 
+def address_of(array: NDArray[Any]) -> int:
+    """Return the address of an array's first element, faster than `ndarray.ctypes`."""
+    return int(array.__array_interface__["data"][0])
+
+
 class Slot:
     """Shared memory of a fixed size.
 
@@ -46,6 +52,8 @@ class Slot:
     size_bytes : int
     descriptor : int
         File descriptor.
+    address : int
+        Address of the memory in this process.
     """
 
     def __init__(self, number: int, size_bytes: int, descriptor: int) -> None:
@@ -53,6 +61,7 @@ class Slot:
         self.size_bytes = size_bytes
         self.descriptor = descriptor
         self._memory = memoryview(mmap.mmap(descriptor, size_bytes))
+        self.address = address_of(np.frombuffer(self._memory, np.uint8))
 
     @classmethod
     def create(cls, number: int, size_bytes: int) -> Slot:
@@ -122,16 +131,15 @@ class Slot:
         self, start: int, shape: tuple[int, ...], dtype: np.dtype[Any]
     ) -> NDArray[Any]:
         """Return a part of the memory as an array; raises as `part` does."""
-        size_bytes = int(np.prod(shape, dtype=np.int64)) * dtype.itemsize
+        size_bytes = math.prod(shape) * dtype.itemsize
         part = self.part(start, size_bytes)
         return np.frombuffer(part, dtype=dtype).reshape(shape)
 
     def put(self, images: Sequence[NDArray[Any]], starts: Sequence[int]) -> None:
         """Copy images to their starts; skip those that are already there."""
         for start, image in zip(starts, images, strict=True):
-            target = self.array(start, image.shape, image.dtype)
-            if target.ctypes.data != image.ctypes.data:
-                np.copyto(target, image)
+            if address_of(image) != self.address + start:
+                np.copyto(self.array(start, image.shape, image.dtype), image)
 
     def close(self) -> None:
         """Close the file; the memory is freed with the last reference to a part."""

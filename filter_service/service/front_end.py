@@ -242,17 +242,20 @@ class FrontEnd:
         if self._supervisor.has_unsent:
             writable = writable | {self._supervisor.fileno()}
         self._router.watch(readable, writable)
-        self._router.wait(self._wait_s())
-        self._supervisor.flush()
+        found = self._router.wait(self._wait_s())
         # Before clients, so that replies reflect the supervisor's latest messages.
-        if not self._receive_from_supervisor():
-            return False
+        if self._supervisor.fileno() in found:
+            self._supervisor.flush()
+            if not self._receive_from_supervisor():
+                return False
         for device in self._devices:
-            self._receive_from(device)
+            if device.render.fileno() in found:
+                self._receive_from(device)
         for number in self._router.pop_ended():
             self._session_manager.disconnect(number)
         self._handle_messages()
-        self._client_textures.receive(self._limits)
+        if self._texture_socket is not None and self._texture_socket.fileno() in found:
+            self._client_textures.receive(self._limits)
         for device in self._devices:
             device.frames.submit_next()
         self._run_periodic_tasks()

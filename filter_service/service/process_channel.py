@@ -170,6 +170,9 @@ class Link:
             if not data:
                 return True
             self._received += data
+            # A read also ends after descriptors; otherwise there was no more data.
+            if len(data) < READ_BYTES and not descriptors:
+                return False
 
     def _pop_messages(self) -> list[tuple[Any, list[int]]]:
         messages = []

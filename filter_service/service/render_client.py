@@ -30,7 +30,7 @@ from filter_service.service.router import Tracker
 from filter_service.service.session import Session, WaitingFrame
 from filter_service.shared_memory import Slot, SlotPool, aligned_starts
 from filter_service.texture_view import COLOR_FORMATS, DEPTH_FORMATS
-from filter_service.wire.images import largest_block_bytes
+from filter_service.wire.images import image_bytes, largest_block_bytes
 
 
 def check_positions(session: Session, frame: Frame) -> None:
@@ -64,7 +64,7 @@ def check_positions(session: Session, frame: Frame) -> None:
             allowed="another than memory.slot",
         )
     sizes = [
-        int(np.prod(shape, dtype=np.int64)) * np.dtype(dtype).itemsize
+        image_bytes(shape, dtype)
         for view in frame.views
         for _, shape, dtype in view.images
     ]
@@ -210,6 +210,10 @@ class RenderClient:
     def restart_timeout(self) -> None:
         """Restart the timeout while a hung worker is being restarted."""
         self._timeout_from_s = self._last_heard_s = time.monotonic()
+
+    def fileno(self) -> int | None:
+        """Return the descriptor to poll; None if no worker is connected."""
+        return None if self._link is None else self._link.fileno()
 
     def descriptors(self) -> tuple[set[int], set[int]]:
         """Return the descriptors to poll for reading and for writing."""
@@ -364,7 +368,7 @@ class RenderClient:
         )
         arrays = [array for images in frame.images for array in images.arrays]
         sizes_bytes = [array.nbytes for array in arrays]
-        bare = replace(frame, images=(), memory=None)
+        bare = replace(frame, images=()) if frame.images else frame
         self.send("frame", number, session.key, bare, places, sizes_bytes)
 
     def _copy_images(self, frame: Frame) -> tuple[SharedPlaces, tuple[Slot, ...]]:
@@ -393,13 +397,10 @@ def completed(
     result: Result, frame: InFlightFrame, started_s: float, blocks_bytes: Sequence[int]
 ) -> Result:
     """Return a result with its images and the times known to the front end."""
+    colors: tuple[NDArray[Any], ...] = ()
     if frame.pool_slots and frame.places is not None:
         _, slot = frame.pool_slots
-        result = replace(
-            result, colors=_output_images(result, slot, frame.places, blocks_bytes)
-        )
-    else:
-        result = replace(result, in_memory=True)
+        colors = _output_images(result, slot, frame.places, blocks_bytes)
     waiting = frame.waiting
     stages_ms = {
         "decode_ms": MS_PER_S * (waiting.decoded_s - waiting.received_s),
@@ -408,7 +409,13 @@ def completed(
     }
     total_ms = MS_PER_S * (time.monotonic() - waiting.received_s)
     stages_ms["other_ms"] = total_ms - sum(stages_ms.values())
-    return replace(result, total_ms=total_ms, stage_times_ms=stages_ms)
+    return replace(
+        result,
+        colors=colors,
+        in_memory=not frame.pool_slots,
+        total_ms=total_ms,
+        stage_times_ms=stages_ms,
+    )
 
 
 def _output_images(

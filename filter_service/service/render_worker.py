@@ -150,8 +150,9 @@ class RenderWorker:
             handle(received)
             while not self._is_stopping:
                 self._watch(selector, control)
-                selector.select(self._wait_s())
-                listen()
+                found = {key.fd for key, _ in selector.select(self._wait_s())}
+                if control.fileno() in found:
+                    listen()
                 self._run_once()
         except LinkClosed:
             log.error("the supervisor exited")

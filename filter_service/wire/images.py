@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
@@ -20,6 +22,11 @@ from filter_service.wire.message import Limits, Part, expect_parts
 Compression = Literal["none", "lz4"]
 
 COMPRESSIONS: tuple[str, ...] = get_args(Compression)
+
+
+def image_bytes(shape: Sequence[int], dtype: str) -> int:
+    """Return the size of an image in bytes."""
+    return math.prod(shape) * np.dtype(dtype).itemsize
 
 
 def largest_block_bytes(size_bytes: int) -> int:
@@ -49,7 +56,7 @@ def unpacked(
     from lz4 import block
 
     wanted = np.dtype(dtype).newbyteorder("<")
-    size_bytes = int(np.prod(shape, dtype=np.int64)) * wanted.itemsize
+    size_bytes = image_bytes(shape, dtype)
     try:
         data = block.decompress(part.data, uncompressed_size=size_bytes)
     except block.LZ4BlockError as error:
@@ -203,6 +210,12 @@ class DepthFormat(Record):
     encoding: DepthEncoding = "float32"
 
 
+@lru_cache(maxsize=64, typed=True)
+def _checked_camera(width_px: int, height_px: int, tangents: Tangents) -> Camera:
+    """Return a camera; the views of a stream have the same one, checked once."""
+    return Camera(width_px, height_px, tangents)
+
+
 @dataclass(frozen=True)
 class ViewHeader(Record):
     """Header of one view of a frame."""
@@ -279,7 +292,7 @@ class ViewHeader(Record):
     @property
     def camera(self) -> Camera:
         """Return the view's camera."""
-        return Camera(self.width_px, self.height_px, self.tangents)
+        return _checked_camera(self.width_px, self.height_px, self.tangents)
 
     @property
     def images(self) -> tuple[tuple[str, tuple[int, ...], str], ...]:
@@ -382,7 +395,7 @@ def image_from_part(
     BadMessage
         If the part does not have exactly the size of the image.
     """
-    expected_bytes = int(np.prod(shape, dtype=np.int64)) * np.dtype(dtype).itemsize
+    expected_bytes = image_bytes(shape, dtype)
     size_bytes = memoryview(part).nbytes
     if size_bytes != expected_bytes:
         raise BadMessage(
@@ -430,8 +443,7 @@ def _from_part(
 ) -> NDArray[Any]:
     if compression == "none":
         return image_from_part(part, shape, dtype, path)
-    size_bytes = int(np.prod(shape, dtype=np.int64)) * np.dtype(dtype).itemsize
-    return block_from_part(part, size_bytes, path)
+    return block_from_part(part, image_bytes(shape, dtype), path)
 
 
 def packed_images(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, ClassVar, Self
 
@@ -67,7 +67,8 @@ def unpack_header(data: bytes | bytearray | memoryview) -> dict[str, Any]:
             field="header",
             allowed=f"1 to {MAX_HEADER_BYTES} bytes",
         )
-    header = _unpacked(data, "header", _HEADER_BOUNDS)
+    # It is too short to have more than MAX_ITEMS items.
+    header = _unpacked(data, "header", _HEADER_BOUNDS, object_pairs_hook=_unique_keys)
     if not isinstance(header, dict):
         raise BadMessage(
             f"it is {show(header)}", field="header", allowed="a msgpack map"
@@ -106,7 +107,12 @@ def unpack_profile(body: bytes) -> dict[str, Any]:
     if body.lstrip()[:1] == b"{":
         profile = _load_json(body)
     else:
-        profile = _unpacked(body, "profile", _PROFILE_BOUNDS)
+        items = _Items()
+        profile = _unpacked(
+            *(body, "profile", _PROFILE_BOUNDS),
+            list_hook=items.count_list,
+            object_pairs_hook=items.count_map,
+        )
     if not isinstance(profile, dict):
         raise BadMessage(
             f"it is {show(profile)}", field="profile", allowed="a JSON or msgpack map"
@@ -138,19 +144,20 @@ class _Items:
 
 
 def _unpacked(
-    data: bytes | bytearray | memoryview, field: str, bounds: Mapping[str, int]
+    data: bytes | bytearray | memoryview,
+    field: str,
+    bounds: Mapping[str, int],
+    **hooks: Callable[[Any], object],
 ) -> object:
-    items = _Items()
     try:
         return msgpack.unpackb(
             data,
             raw=False,
             use_list=True,
             strict_map_key=False,  # the error of _unique_keys includes the key
-            list_hook=items.count_list,
-            object_pairs_hook=items.count_map,
             ext_hook=_reject_extension,
             **bounds,
+            **hooks,
         )
     except (ValueError, msgpack.UnpackException) as error:
         reason = str(error) or type(error).__name__
@@ -210,7 +217,7 @@ def _check_values(root: object, name: str, *, finite: bool = False) -> None:
                 field=name,
                 allowed=f"at most {MAX_DEPTH}",
             )
-        pairs: Iterable[tuple[object, object]]
+        pairs: Iterable[tuple[Any, Any]]
         if isinstance(value, dict):
             pairs = value.items()
         elif isinstance(value, list):
@@ -218,23 +225,24 @@ def _check_values(root: object, name: str, *, finite: bool = False) -> None:
         else:
             continue
         for key, item in pairs:
-            if isinstance(item, dict | list):
-                waiting.append(((path, key), item, depth + 1))
-            elif isinstance(item, str):
-                if len(item) > MAX_TEXT:
-                    raise BadMessage(
-                        f"it has {len(item)} characters",
-                        field=_format_path((path, key)),
-                        allowed=f"at most {MAX_TEXT} characters",
-                    )
-            elif isinstance(item, float):
+            kind = type(item)  # as parsers return: no subclasses
+            if kind is float:
                 if finite and not math.isfinite(item):
                     raise BadMessage(
                         f"it is {item!r}",
                         field=_format_path((path, key)),
                         allowed="a finite number",
                     )
-            elif isinstance(item, int) and item.bit_length() > MAX_BITS:
+            elif kind is dict or kind is list:
+                waiting.append(((path, key), item, depth + 1))
+            elif kind is str:
+                if len(item) > MAX_TEXT:
+                    raise BadMessage(
+                        f"it has {len(item)} characters",
+                        field=_format_path((path, key)),
+                        allowed=f"at most {MAX_TEXT} characters",
+                    )
+            elif kind is int and item.bit_length() > MAX_BITS:
                 raise BadMessage(
                     f"it is an integer of {item.bit_length()} bits",
                     field=_format_path((path, key)),
