@@ -18,6 +18,7 @@ from filter_service.errors import ServiceTimeout
 from filter_service.keys import ClientKey
 from filter_service.waiting import Wait
 
+READABLE = int(zmq.POLLIN)
 COPY_BELOW_BYTES = 65536  # pyzmq always copies smaller parts
 MAX_BUFFERS_PER_SIZE = 8
 HEARTBEAT_INTERVAL_MS = 500
@@ -168,7 +169,7 @@ class Connection:
     @staticmethod
     def _has_message(socket: zmq.Socket[bytes]) -> bool:
         """Return whether a message can be received, much faster than by `recv`."""
-        return bool(int(socket.get(zmq.EVENTS)) & zmq.POLLIN)
+        return bool(int(socket.get(zmq.EVENTS)) & READABLE)
 
     def changes(self) -> list[bool]:
         """Return the connection changes since the last call; True means connected."""

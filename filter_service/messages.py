@@ -212,14 +212,25 @@ def encode(message: Message) -> list[Any]:
     ValueError
         If the header is too long, or an image does not match its header.
     """
-    header = {"type": message.type_name, "version": PROTOCOL_VERSION}
-    packed = msgpack.packb(header | message.fields())
+    return [packed_header(message.type_name, message.fields()), *message.parts()]
+
+
+def packed_header(type_name: str, fields: Mapping[str, Any]) -> bytes:
+    """Return the header of a message with these fields.
+
+    Raises
+    ------
+    ValueError
+        If the header is too long.
+    """
+    header = {"type": type_name, "version": PROTOCOL_VERSION, **fields}
+    packed: bytes = msgpack.packb(header)
     if len(packed) > MAX_HEADER_BYTES:
         raise ValueError(
-            f"the header of {message.type_name} has {len(packed)} bytes; "
+            f"the header of {type_name} has {len(packed)} bytes; "
             f"at most {MAX_HEADER_BYTES} are allowed"
         )
-    return [packed, *message.parts()]
+    return packed
 
 
 def is_bye(parts: Sequence[Part]) -> bool:

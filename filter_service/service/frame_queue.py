@@ -9,17 +9,17 @@ import math
 import time
 from collections.abc import Callable, Hashable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 from filter_service.errors import OutOfMemory, RenderFailed
-from filter_service.messages import Dropped, ErrorReply, Frame, Reply, Result
+from filter_service.messages import Dropped, ErrorReply, Frame, Reply
 from filter_service.service.connections import Peer
 from filter_service.service.render_client import (
     InFlightFrame,
     RenderClient,
     UnsentResults,
     check_positions,
-    completed,
+    result_parts,
 )
 from filter_service.service.router import Tracker
 from filter_service.service.session import Session, WaitingFrame
@@ -143,7 +143,8 @@ RECHECK_INTERVAL_S = 0.002
 RETRY_AFTER_MS = 100.0
 """Delay after which a client may retry a dropped frame."""
 
-FrameReply = Result | Dropped | ErrorReply
+FrameReply = Dropped | ErrorReply | list[Any]
+"""Reply to a frame; a result is given as the parts of its message."""
 
 
 class FrameQueue:
@@ -155,7 +156,8 @@ class FrameQueue:
         Returns the sessions on this device with a connected client.
     render : RenderClient
     send : callable
-        ``send(peer, reply)`` sends a reply, and returns a tracker if it is large.
+        ``send(peer, reply)`` sends a reply or the parts of one, and returns a tracker
+        if it is large.
 
     Attributes
     ----------
@@ -170,7 +172,7 @@ class FrameQueue:
         self,
         sessions: Callable[[], Sequence[Session]],
         render: RenderClient,
-        send: Callable[[Peer, Reply], Tracker | None],
+        send: Callable[[Peer, Reply | list[Any]], Tracker | None],
     ) -> None:
         self.n_rendered = self.n_dropped = 0
         self.filtered_s = 0.0
@@ -212,7 +214,7 @@ class FrameQueue:
         self._queue.forget(session.key)
 
     def enqueue(
-        self, session: Session, frame: Frame, received_s: float
+        self, session: Session, frame: Frame, header: bytes, received_s: float
     ) -> Frame | None:
         """Queue a frame as its client's newest; return the frame that it supersedes.
 
@@ -224,7 +226,7 @@ class FrameQueue:
             If the client has too many unanswered frames.
         """
         check_positions(session, frame)
-        waiting = WaitingFrame(frame, received_s, time.monotonic())
+        waiting = WaitingFrame(frame, header, received_s, time.monotonic())
         superseded = session.enqueue(waiting)
         session.mark_in_use(frame)
         self._queue.mark_waiting(session.key)
@@ -281,13 +283,13 @@ class FrameQueue:
     def accept_result(
         self,
         number: int,
-        reply: FrameReply,
+        reply: dict[str, Any] | Dropped | ErrorReply,
         started_s: float,
         ended_s: float,
         used_s: float,
         blocks_bytes: Sequence[int],
     ) -> None:
-        """Forward a reply of the render worker to its client."""
+        """Forward a reply of the render worker to its client; see `result_parts`."""
         submitted = self._render.pop_frame(number)
         if submitted is None:
             return
@@ -300,11 +302,14 @@ class FrameQueue:
         )
         self.filtered_s += used_s
         self.load.add(used_s, ended_s)
-        if isinstance(reply, Result):
-            reply = completed(reply, submitted, started_s, blocks_bytes)
+        sent: FrameReply
+        if isinstance(reply, dict):
+            sent = result_parts(reply, submitted, started_s, blocks_bytes)
         elif isinstance(reply, Dropped):
-            reply = replace(reply, retry_after_ms=RETRY_AFTER_MS)
-        tracker = self._reply_in_flight(submitted, reply)
+            sent = replace(reply, retry_after_ms=RETRY_AFTER_MS)
+        else:
+            sent = reply
+        tracker = self._reply_in_flight(submitted, sent)
         if not submitted.pool_slots:
             return
         slot, result_slot = submitted.pool_slots
@@ -332,7 +337,7 @@ class FrameQueue:
             return None  # its client has disconnected
         session.n_unanswered = max(0, session.n_unanswered - 1)
         session.mark_free(frame)
-        if isinstance(reply, Result):
+        if isinstance(reply, list):
             self.n_rendered += 1
         else:
             self.n_dropped += 1

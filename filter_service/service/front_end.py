@@ -428,7 +428,7 @@ class FrontEnd:
             if isinstance(request, Frame):
                 session = self._session_manager.session_of(peer)
                 frames = self._frames_of(session)
-                older = frames.enqueue(session, request, received_s)
+                older = frames.enqueue(session, request, bytes(parts[0]), received_s)
                 superseded += [(session, older)] if older is not None else []
             else:
                 self._count_request(received)
@@ -513,9 +513,10 @@ class FrontEnd:
         with suppress(LinkClosed):  # this process then ends
             self._supervisor.send(("session", key, record))
 
-    def _send(self, peer: Peer, reply: Reply) -> Tracker | None:
-        """Send a reply; disconnect a client that does not read its replies."""
-        outcome, tracker = self._router.send(peer, encode(reply))
+    def _send(self, peer: Peer, reply: Reply | list[Any]) -> Tracker | None:
+        """Send a reply or its parts; disconnect a client that does not read replies."""
+        parts = reply if isinstance(reply, list) else encode(reply)
+        outcome, tracker = self._router.send(peer, parts)
         if outcome is Outcome.GONE:
             self._session_manager.disconnect(peer.connection)
         elif outcome is Outcome.STALLED:

@@ -10,11 +10,8 @@ from __future__ import annotations
 import contextlib
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
 
 from filter_service.errors import BadMessage, OutOfMemory
 from filter_service.messages import (
@@ -23,6 +20,7 @@ from filter_service.messages import (
     SharedPlaces,
     ViewHeader,
     ViewTextures,
+    packed_header,
 )
 from filter_service.service.connections import DescriptorLimit, Peer
 from filter_service.service.process_channel import Link, LinkClosed
@@ -368,8 +366,7 @@ class RenderClient:
         )
         arrays = [array for images in frame.images for array in images.arrays]
         sizes_bytes = [array.nbytes for array in arrays]
-        bare = replace(frame, images=()) if frame.images else frame
-        self.send("frame", number, session.key, bare, places, sizes_bytes)
+        self.send("frame", number, session.key, waiting.header, places, sizes_bytes)
 
     def _copy_images(self, frame: Frame) -> tuple[SharedPlaces, tuple[Slot, ...]]:
         """Copy the images of a frame to slots of the pool."""
@@ -393,42 +390,37 @@ class RenderClient:
         return self.in_flight.pop(number, None)
 
 
-def completed(
-    result: Result, frame: InFlightFrame, started_s: float, blocks_bytes: Sequence[int]
-) -> Result:
-    """Return a result with its images and the times known to the front end."""
-    colors: tuple[NDArray[Any], ...] = ()
-    if frame.pool_slots and frame.places is not None:
-        _, slot = frame.pool_slots
-        colors = _output_images(result, slot, frame.places, blocks_bytes)
+def result_parts(
+    fields: dict[str, Any],
+    frame: InFlightFrame,
+    started_s: float,
+    blocks_bytes: Sequence[int],
+) -> list[Any]:
+    """Return the parts of a result message.
+
+    Parameters
+    ----------
+    fields : dict
+        Header fields from the render worker; the front end adds times that it knows.
+    frame : InFlightFrame
+    started_s : float
+        Time at which the worker started the frame.
+    blocks_bytes : sequence of int
+        Sizes of the images in bytes.
+    """
     waiting = frame.waiting
     stages_ms = {
         "decode_ms": MS_PER_S * (waiting.decoded_s - waiting.received_s),
         "queue_ms": MS_PER_S * (started_s - waiting.decoded_s),
-        **result.stage_times_ms,
+        **fields["stage_times_ms"],
     }
     total_ms = MS_PER_S * (time.monotonic() - waiting.received_s)
     stages_ms["other_ms"] = total_ms - sum(stages_ms.values())
-    return replace(
-        result,
-        colors=colors,
-        in_memory=not frame.pool_slots,
-        total_ms=total_ms,
-        stage_times_ms=stages_ms,
-    )
-
-
-def _output_images(
-    result: Result, slot: Slot, places: SharedPlaces, blocks_bytes: Sequence[int]
-) -> tuple[NDArray[Any], ...]:
-    if result.compression != "none":
-        return tuple(
-            slot.array(start, (size,), np.dtype(np.uint8))
-            for start, size in zip(places.result_starts, blocks_bytes, strict=True)
-        )
-    return tuple(
-        slot.array(
-            start, (view.height_px, view.width_px, 3), np.dtype(view.color.dtype)
-        )
-        for start, view in zip(places.result_starts, result.views, strict=True)
-    )
+    times = {"total_ms": total_ms, "stage_times_ms": stages_ms}
+    fields = fields | times | {"in_memory": not frame.pool_slots}
+    header = packed_header(Result.type_name, fields)
+    if not frame.pool_slots or frame.places is None:
+        return [header]
+    _, slot = frame.pool_slots
+    starts = frame.places.result_starts
+    return [header, *map(slot.part, starts, blocks_bytes)]

@@ -12,8 +12,8 @@ Messages from the front end:
 - ``("open", key, session_id, generations)``, where ``generations`` belong to the
   session's eyes; ``("close", key)``
 - ``("profile", key, request)``
-- ``("frame", number, key, frame, places, sizes)``, where ``sizes`` refer to
-  compressed parts
+- ``("frame", number, key, header, places, sizes)``, where ``header`` was received from
+  the client, and ``sizes`` refer to compressed parts
 
 Messages to the front end:
 
@@ -22,7 +22,8 @@ Messages to the front end:
 - ``("profile_reply", key, eye, reply)``
 - ``("profile_used", key, used_s)``, the processor time of reading a profile, before the
   reply
-- ``("frame_reply", number, reply, started_s, ended_s, used_s, blocks_bytes)``
+- ``("frame_reply", number, reply, started_s, ended_s, used_s, blocks_bytes)``; a result
+  is the map of its header fields
 - ``("state", memory_mb, stores_mb, is_building)``
 """
 
@@ -47,10 +48,15 @@ from filter_service.messages import (
     Frame,
     ProfileRequest,
     Reply,
+    Result,
     SharedPlaces,
     ShareTexture,
 )
-from filter_service.service.frame_reply import filter_in_slots, filter_in_textures
+from filter_service.service.frame_reply import (
+    filter_in_slots,
+    filter_in_textures,
+    frame_of,
+)
 from filter_service.service.process_channel import (
     Link,
     LinkClosed,
@@ -391,12 +397,12 @@ class RenderWorker:
         self,
         number: int,
         key: str,
-        frame: Frame,
+        header: bytes,
         places: SharedPlaces | None,
         sizes_bytes: Sequence[int],
     ) -> None:
         """Filter a frame; a frame that interrupts another is not interrupted itself."""
-        started_s = time.monotonic()
+        started_s, frame = time.monotonic(), frame_of(header)
         is_first = self._frame_since_s is None
         if is_first:
             self._frame_since_s, self._interrupted_s = started_s, 0.0
@@ -413,7 +419,8 @@ class RenderWorker:
         self._trim_at_s = ended_s + TRIM_AFTER_S
         used_s = ended_s - started_s - interrupted_s
         times_s = (started_s, ended_s, used_s)
-        self._send(("frame_reply", number, reply, *times_s, blocks_bytes))
+        sent = reply.fields() if isinstance(reply, Result) else reply
+        self._send(("frame_reply", number, sent, *times_s, blocks_bytes))
 
     def _reply_to(
         self,

@@ -33,6 +33,7 @@ ZAP_ENDPOINT = "inproc://zeromq.zap.01"
 ZAP_VERSION = b"1.0"
 ZAP_DOMAIN = b"ocufilter"
 MAX_REQUESTS_PER_TURN = 64
+READABLE = int(zmq.POLLIN)
 
 log = logging.getLogger("ocufilter")
 
@@ -116,7 +117,7 @@ def has_message(socket: zmq.Socket[bytes]) -> bool:
 
     This takes a fraction of the time of the exception that `recv` raises otherwise.
     """
-    return bool(int(socket.get(zmq.EVENTS)) & zmq.POLLIN)
+    return bool(int(socket.get(zmq.EVENTS)) & READABLE)
 
 
 def parse_user_id(user_id: str) -> tuple[int, str]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
+from typing import Any
 
 from filter_service.messages import DeviceState, Reply
 from filter_service.service.connections import DescriptorLimit, Peer
@@ -60,7 +61,7 @@ class ServedDevice:
         max_image_bytes: int,
         descriptors: DescriptorLimit,
         sessions: SessionTable,
-        send: Callable[[Peer, Reply], Tracker | None],
+        send: Callable[[Peer, Reply | list[Any]], Tracker | None],
     ) -> None:
         self.index = index
         self.name = name
@@ -114,7 +115,7 @@ class ServedDevices:
         max_image_bytes: int,
         descriptors: DescriptorLimit,
         sessions: SessionTable,
-        send: Callable[[Peer, Reply], Tracker | None],
+        send: Callable[[Peer, Reply | list[Any]], Tracker | None],
     ) -> None:
         self._sessions = sessions
         self._devices = [

@@ -31,9 +31,10 @@ the service has lost it."""
 
 @dataclass(frozen=True)
 class WaitingFrame:
-    """A queued frame, and the times at which it was received and decoded."""
+    """A queued frame, its header, and the times of its receipt and decoding."""
 
     frame: Frame
+    header: bytes
     received_s: float
     decoded_s: float
 

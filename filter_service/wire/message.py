@@ -73,7 +73,7 @@ def unpack_header(data: bytes | bytearray | memoryview) -> dict[str, Any]:
         raise BadMessage(
             f"it is {show(header)}", field="header", allowed="a msgpack map"
         )
-    _check_values(header, "header")
+    _check_depth(header, "header")  # other limits are _HEADER_BOUNDS or msgpack's own
     return header
 
 
@@ -117,7 +117,7 @@ def unpack_profile(body: bytes) -> dict[str, Any]:
         raise BadMessage(
             f"it is {show(profile)}", field="profile", allowed="a JSON or msgpack map"
         )
-    _check_values(profile, "profile", finite=True)
+    _check_values(profile, "profile")
     return profile
 
 
@@ -202,21 +202,36 @@ _Path = tuple[Any, Any]
 """Path of a value: the path of its map or list, and its key there."""
 
 
-def _check_values(root: object, name: str, *, finite: bool = False) -> None:
-    """Raise BadMessage for values nested too deep and for too large texts or integers.
-
-    With ``finite``, raise also for NaN and infinity.  This does not recurse, and
-    formats a path only for an invalid value.
-    """
-    waiting: list[tuple[_Path, object, int]] = [((None, name), root, 1)]
-    while waiting:
-        path, value, depth = waiting.pop()
+def _check_depth(root: object, name: str) -> None:
+    """Raise BadMessage for lists and maps that are nested too deep."""
+    level, depth = [root], 1
+    while level:
         if depth > MAX_DEPTH:
             raise BadMessage(
                 f"lists and maps are nested {depth} deep",
                 field=name,
                 allowed=f"at most {MAX_DEPTH}",
             )
+        level = [
+            item
+            for value in level
+            for item in (value.values() if isinstance(value, dict) else value)
+            if isinstance(item, dict | list)
+        ]
+        depth += 1
+
+
+def _check_values(root: object, name: str) -> None:
+    """Raise BadMessage for values that a profile must not contain.
+
+    These are values nested too deep, texts and integers that are too large, and numbers
+    that are not finite.  This does not recurse, and formats a path only for an invalid
+    value.
+    """
+    _check_depth(root, name)
+    waiting: list[tuple[_Path, object]] = [((None, name), root)]
+    while waiting:
+        path, value = waiting.pop()
         pairs: Iterable[tuple[Any, Any]]
         if isinstance(value, dict):
             pairs = value.items()
@@ -225,24 +240,23 @@ def _check_values(root: object, name: str, *, finite: bool = False) -> None:
         else:
             continue
         for key, item in pairs:
-            kind = type(item)  # as parsers return: no subclasses
-            if kind is float:
-                if finite and not math.isfinite(item):
+            if isinstance(item, float):
+                if not math.isfinite(item):
                     raise BadMessage(
                         f"it is {item!r}",
                         field=_format_path((path, key)),
                         allowed="a finite number",
                     )
-            elif kind is dict or kind is list:
-                waiting.append(((path, key), item, depth + 1))
-            elif kind is str:
+            elif isinstance(item, dict | list):
+                waiting.append(((path, key), item))
+            elif isinstance(item, str):
                 if len(item) > MAX_TEXT:
                     raise BadMessage(
                         f"it has {len(item)} characters",
                         field=_format_path((path, key)),
                         allowed=f"at most {MAX_TEXT} characters",
                     )
-            elif kind is int and item.bit_length() > MAX_BITS:
+            elif isinstance(item, int) and item.bit_length() > MAX_BITS:
                 raise BadMessage(
                     f"it is an integer of {item.bit_length()} bits",
                     field=_format_path((path, key)),

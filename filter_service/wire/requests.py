@@ -33,7 +33,6 @@ from filter_service.wire.images import (
     check_part_size,
     images_from_parts,
     packed_images,
-    unpacked_images,
 )
 from filter_service.wire.message import (
     Id,
@@ -169,18 +168,6 @@ class Frame(Message):
             return self
         images = packed_images(self.views, self.images)
         return replace(self, images=images, compression=compression)
-
-    def unpacked(self) -> Self:
-        """Return the frame with decompressed images; its result may be compressed.
-
-        Raises
-        ------
-        BadMessage
-            If a block is invalid.
-        """
-        if self.compression == "none":
-            return self
-        return replace(self, images=unpacked_images(self.views, self.images))
 
     def with_parts(self, parts: Sequence[Part], limits: Limits) -> Self:
         """Return the frame with arrays over its parts, without copying."""

@@ -21,7 +21,7 @@ from filter_service.messages import (
     decode_request,
     encode,
 )
-from filter_service.service.frame_reply import with_images
+from filter_service.service.frame_reply import frame_of, images_in
 from filter_service.shared_memory import Slot, aligned_starts
 from tests.unit.message_parts import (
     CAMERA,
@@ -47,6 +47,18 @@ def test_what_the_service_says_arrives_unchanged(message):
     assert decode_reply(as_bytes(encode(message))) == message
 
 
+@pytest.mark.parametrize(
+    "message",
+    [m for m in REQUESTS if m.type_name == "frame"],
+    ids=lambda m: f"{len(m.views)} views",
+)
+def test_a_render_worker_reads_the_same_frame_from_a_checked_header(message):
+    header = as_bytes(encode(message))[0]
+    received = frame_of(header)
+    assert received == message
+    assert [view.camera for view in received.views] == [v.camera for v in message.views]
+
+
 def test_images_in_shared_memory_are_read_only_for_the_filter():
     """The client has them, too, and may send them again."""
     sent = frame()
@@ -54,7 +66,7 @@ def test_images_in_shared_memory_are_read_only_for_the_filter():
     starts, size_bytes = aligned_starts([array.nbytes for array in arrays])
     slot = Slot.create(1, size_bytes)
     slot.put(arrays, starts)
-    (found,) = with_images(sent, slot, starts, ()).images
+    (found,) = images_in(sent, slot, starts, ())
     for array, expected in zip((found.color, found.depth_m), arrays, strict=True):
         np.testing.assert_array_equal(array, expected)
         with pytest.raises(ValueError, match="read-only"):

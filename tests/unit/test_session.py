@@ -51,7 +51,7 @@ def build_all(stream):
 def test_credit_counts_unanswered_frames_and_the_newest_waits():
     session = Session(1, b"a", "", credit=2)
     view = (ViewHeader.of(SMALL),)
-    frames = [WaitingFrame(Frame(i, view, 4.0, 0.0), 0.0, 0.0) for i in range(3)]
+    frames = [WaitingFrame(Frame(i, view, 4.0, 0.0), b"", 0.0, 0.0) for i in range(3)]
     assert session.enqueue(frames[0]) is None
     assert session.enqueue(frames[1]) is frames[0]
     with pytest.raises(CreditExceeded, match="2 frames are unanswered"):
