@@ -108,6 +108,9 @@ class Builder:
 
     Attributes
     ----------
+    wakes_after_frames : bool
+        Whether a frame wakes the thread when it ends; otherwise, the caller calls
+        `prepare` once it has passed the result on.
     has_events : object with a descriptor
         It can be read from when there are events for `deliver_all`.
     """
@@ -126,6 +129,7 @@ class Builder:
         self.streams: list[StreamEyes] = []
         self.frame_s = 0.0  # duration of the last frame
         self.n_advances = 0  # of builds and of first PSFs: it changes as they advance
+        self.wakes_after_frames = True
         self.has_events = Signal()
         self._last_progress: BuildProgress | None = None
         self._limits = limits
@@ -173,7 +177,8 @@ class Builder:
         ):
             low_s, high_s = FIRST_RANGE_S
             self._lock.reserve(min(max(FIRST_SHARE * duration_s, low_s), high_s))
-        self._wake.set()
+        if self.wakes_after_frames:
+            self._wake.set()
         self.deliver(stream)
 
     def let_thread_work(self) -> None:

@@ -235,13 +235,11 @@ class FrontEnd:
 
     def _run_once(self) -> bool:
         """Run one iteration of the event loop; return whether to continue."""
-        readable, writable = self._devices.descriptors()
-        readable = readable | {self._supervisor.fileno()}
+        watched = self._devices.descriptors()
+        watched[self._supervisor.fileno()] = self._supervisor.has_unsent
         if self._texture_socket is not None:
-            readable = readable | {self._texture_socket.fileno()}
-        if self._supervisor.has_unsent:
-            writable = writable | {self._supervisor.fileno()}
-        self._router.watch(readable, writable)
+            watched[self._texture_socket.fileno()] = False
+        self._router.watch(watched)
         found = self._router.wait(self._wait_s())
         # Before clients, so that replies reflect the supervisor's latest messages.
         if self._supervisor.fileno() in found:

@@ -213,12 +213,10 @@ class RenderClient:
         """Return the descriptor to poll; None if no worker is connected."""
         return None if self._link is None else self._link.fileno()
 
-    def descriptors(self) -> tuple[set[int], set[int]]:
-        """Return the descriptors to poll for reading and for writing."""
-        if self._link is None:
-            return set(), set()
-        found = {self._link.fileno()}
-        return found, found if self._link.has_unsent else set()
+    @property
+    def has_unsent(self) -> bool:
+        """Return whether messages wait until the descriptor is writable."""
+        return self._link is not None and self._link.has_unsent
 
     def connect(self, link: Link) -> None:
         """Connect to a new render worker and send it all slots."""

@@ -105,6 +105,7 @@ class RenderWorker:
         max_cameras: int,
     ) -> None:
         self._builder = builder
+        builder.wakes_after_frames = False  # the reply goes first
         self._reader = ProfileReader(read_profile)
         self._max_cameras = max_cameras
         self._sessions: dict[str, SessionEyes] = {}
@@ -419,8 +420,12 @@ class RenderWorker:
         self._trim_at_s = ended_s + TRIM_AFTER_S
         used_s = ended_s - started_s - interrupted_s
         times_s = (started_s, ended_s, used_s)
-        sent = reply.fields() if isinstance(reply, Result) else reply
-        self._send(("frame_reply", number, sent, *times_s, blocks_bytes))
+        if isinstance(reply, Result):
+            sent = reply.fields()
+            self._send(("frame_reply", number, sent, *times_s, blocks_bytes))
+            self._builder.prepare()
+        else:
+            self._send(("frame_reply", number, reply, *times_s, blocks_bytes))
 
     def _reply_to(
         self,

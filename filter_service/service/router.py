@@ -343,7 +343,7 @@ class Router:
         self._poller = zmq.Poller()
         for watched in (socket, self._authenticator.socket, self._monitor):
             self._poller.register(watched, zmq.POLLIN)
-        self._watched: tuple[set[int], set[int]] = set(), set()
+        self._watched: dict[int, bool] = {}
         self._next_monitored_s = 0.0
 
     @property
@@ -351,17 +351,22 @@ class Router:
         """Return whether surplus parts of a message are being dropped."""
         return self._oversized is not None
 
-    def watch(self, readable: set[int], writable: set[int]) -> None:
-        """Set the other descriptors for which `wait` returns."""
-        if (readable, writable) == self._watched:
+    def watch(self, descriptors: dict[int, bool]) -> None:
+        """Set the other descriptors for which `wait` returns.
+
+        Parameters
+        ----------
+        descriptors : dict
+            Whether each is awaited to be writable, too, not only readable.
+        """
+        if descriptors == self._watched:
             return
-        for gone in set.union(*self._watched) - readable - writable:
+        for gone in self._watched.keys() - descriptors.keys():
             self._poller.unregister(gone)
-        for descriptor in readable | writable:
-            reads = zmq.POLLIN if descriptor in readable else 0
-            writes = zmq.POLLOUT if descriptor in writable else 0
-            self._poller.register(descriptor, reads | writes)
-        self._watched = readable, writable
+        for descriptor, has_unsent in descriptors.items():
+            events = zmq.POLLIN | zmq.POLLOUT if has_unsent else zmq.POLLIN
+            self._poller.register(descriptor, events)
+        self._watched = descriptors
 
     def wait(self, timeout_s: float) -> set[int]:
         """Wait for messages, connection events or watched descriptors, or a timeout.

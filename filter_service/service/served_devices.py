@@ -189,10 +189,10 @@ class ServedDevices:
         """Return the total resident memory of the render workers, 10^6 bytes."""
         return sum(device.memory_mb for device in self)
 
-    def descriptors(self) -> tuple[set[int], set[int]]:
-        """Return the descriptors to poll for reading and for writing."""
-        pairs = [device.render.descriptors() for device in self]
-        return set().union(*(r for r, _ in pairs)), set().union(*(w for _, w in pairs))
+    def descriptors(self) -> dict[int, bool]:
+        """Return the descriptors to poll, see `Router.watch`."""
+        found = {device.render.fileno(): device.render.has_unsent for device in self}
+        return {number: has for number, has in found.items() if number is not None}
 
     def wait_s(self, now_s: float) -> float | None:
         """Return the time until a frame may be submitted; None if none is queued."""
