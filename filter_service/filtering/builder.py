@@ -145,6 +145,11 @@ class Builder:
         """Return the memory of all streams' PSFs, 10^6 bytes."""
         return sum(prepared.store.memory_mb for prepared in self._prepared())
 
+    @property
+    def tables_mb(self) -> float:
+        """Return the memory of the tables of all streams' PSFs, 10^6 bytes."""
+        return sum(prepared.store.tables_mb for prepared in self._prepared())
+
     def _prepared(self) -> list[PreparedStore]:
         return [
             prepared

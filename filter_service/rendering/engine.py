@@ -189,6 +189,10 @@ class FrameEngine(Protocol):
     def importer(self) -> Any:
         """Importer of textures of other processes (`gl.renderer.Importer`), or None."""
 
+    @property
+    def memory_mb(self) -> float:
+        """Memory of the buffers that frames reuse, 10^6 bytes; gl: all on the GPU."""
+
     def trim(self) -> None:
         """Release buffers that frames reuse; called after an idle period."""
 

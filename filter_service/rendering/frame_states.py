@@ -224,6 +224,12 @@ class FrameStore:
         return self.store.memory_mb + self._exact_mb
 
     @property
+    def tables_mb(self) -> float:
+        """Memory of the tables and nodes, MB."""
+        exact_mb = sum(handle.tables_mb for handle in self._exact.values())
+        return self.store.tables_mb + exact_mb
+
+    @property
     def _exact_mb(self) -> float:
         return sum(handle.memory_mb for handle in self._exact.values())
 

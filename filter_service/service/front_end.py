@@ -158,6 +158,7 @@ class FrontEnd:
     def metrics(self) -> dict[str, float]:
         """Return the values of `METRICS`; called from another thread."""
         queues = [device.frames for device in self._devices]
+        memory = [device.memory for device in self._devices]
         return {
             "ocufilter_ready": float(self._devices.are_ready),
             "ocufilter_degraded": float(self._is_degraded),
@@ -171,7 +172,9 @@ class FrontEnd:
             "ocufilter_messages_unheard_total": self._n_ignored,
             "ocufilter_faults_total": self._n_faults,
             "ocufilter_memory_bytes": MB * self._memory_mb,
-            "ocufilter_psfs_bytes": MB * sum(d.stores_mb for d in self._devices),
+            "ocufilter_psfs_bytes": MB * sum(m.stores_mb for m in memory),
+            "ocufilter_psf_tables_bytes": MB * sum(m.tables_mb for m in memory),
+            "ocufilter_frame_buffers_bytes": MB * sum(m.buffers_mb for m in memory),
             "ocufilter_render_silent_seconds": self._devices.silent_s,
         }
 
@@ -315,7 +318,7 @@ class FrontEnd:
                 elif kind == "profile_used":
                     self._session_manager.charge_profile(*rest)
                 elif kind == "state":
-                    device.memory_mb, device.stores_mb, device.is_building = rest
+                    device.memory, device.is_building = rest
                 elif kind == "texture_reply":
                     self._client_textures.accept_import(*rest)
                 elif kind == "started":

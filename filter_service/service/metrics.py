@@ -36,6 +36,8 @@ METRICS = {
     "ocufilter_faults_total": "unexpected errors of the service",
     "ocufilter_memory_bytes": "memory of the front end and the render workers",
     "ocufilter_psfs_bytes": "part of it that is used by PSFs",
+    "ocufilter_psf_tables_bytes": "part of it that is used by tables of PSFs",
+    "ocufilter_frame_buffers_bytes": "buffers that frames reuse; gl: all on the GPU",
     "ocufilter_render_silent_seconds": "time since the last worker heartbeat",
 }
 

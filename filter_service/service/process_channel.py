@@ -19,10 +19,29 @@ from collections import deque
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 from filter_service.log_lines import configure_logging
 from filter_service.service.config import ServiceConfig
+
+
+class WorkerMemory(NamedTuple):
+    """Memory of a render worker, 10^6 bytes.
+
+    Attributes
+    ----------
+    resident_mb : float
+        Resident memory of the process.
+    stores_mb, tables_mb : float
+        Kernels of all PSFs at all resolutions, and the tables and nodes of them.
+    buffers_mb : float
+        Buffers that frames reuse.
+    """
+
+    resident_mb: float = 0.0
+    stores_mb: float = 0.0
+    tables_mb: float = 0.0
+    buffers_mb: float = 0.0
 
 
 def resident_memory_mb() -> float:

@@ -24,7 +24,7 @@ Messages to the front end:
   reply
 - ``("frame_reply", number, reply, started_s, ended_s, used_s, blocks_bytes)``; a result
   is the map of its header fields
-- ``("state", memory_mb, stores_mb, is_building)``
+- ``("state", memory, is_building)``, with `WorkerMemory`
 """
 
 from __future__ import annotations
@@ -60,6 +60,7 @@ from filter_service.service.frame_reply import (
 from filter_service.service.process_channel import (
     Link,
     LinkClosed,
+    WorkerMemory,
     resident_memory_mb,
     trim_heap,
 )
@@ -272,8 +273,13 @@ class RenderWorker:
         if is_due or now_s >= self._next_state_s:
             self._next_state_s = now_s + STATE_INTERVAL_S
             is_building = self._builder.worker.is_busy
-            stores_mb = self._builder.stores_mb
-            self._send(("state", resident_memory_mb(), stores_mb, is_building))
+            memory = WorkerMemory(
+                resident_memory_mb(),
+                self._builder.stores_mb,
+                self._builder.tables_mb,
+                self._builder.engine.memory_mb,
+            )
+            self._send(("state", memory, is_building))
 
     def _send(self, message: tuple[Any, ...]) -> None:
         if self._front_end is None:

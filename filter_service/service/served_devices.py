@@ -14,6 +14,7 @@ from typing import Any
 from filter_service.messages import DeviceState, Reply
 from filter_service.service.connections import DescriptorLimit, Peer
 from filter_service.service.frame_queue import FrameQueue
+from filter_service.service.process_channel import WorkerMemory
 from filter_service.service.render_client import RenderClient
 from filter_service.service.router import Tracker
 from filter_service.service.session import Session, SessionTable
@@ -47,7 +48,7 @@ class ServedDevice:
         Description reported by its render worker; None until then.
     texture_support : TextureSupport, optional
         Textures that its render worker imports; None if it imports none.
-    memory_mb, stores_mb : float
+    memory : WorkerMemory
     is_building : bool
         State last reported by its render worker.
     is_lost : bool
@@ -71,13 +72,13 @@ class ServedDevice:
         )
         self.server: dict[str, str] | None = None
         self.texture_support: TextureSupport | None = None
-        self.memory_mb = self.stores_mb = 0.0
+        self.memory = WorkerMemory()
         self.is_building = self.is_lost = False
 
     def mark_lost(self) -> None:
         """Mark the device as out of service."""
         self.is_lost, self.is_building = True, False
-        self.memory_mb = self.stores_mb = 0.0
+        self.memory = WorkerMemory()
 
     def state(self, sessions: Sequence[Session]) -> DeviceState:
         """Return the device's state for `pong`, given its connected sessions."""
@@ -87,7 +88,7 @@ class ServedDevice:
             n_sessions=len(sessions),
             busy_ratio=self.frames.load.busy_ratio(time.monotonic()),
             n_rendered=self.frames.n_rendered,
-            memory_mb=self.memory_mb,
+            memory_mb=self.memory.resident_mb,
             is_ready=self.render.is_ready,
             is_filtering=bool(self.render.in_flight),
             is_building=self.is_building
@@ -187,7 +188,7 @@ class ServedDevices:
     @property
     def memory_mb(self) -> float:
         """Return the total resident memory of the render workers, 10^6 bytes."""
-        return sum(device.memory_mb for device in self)
+        return sum(device.memory.resident_mb for device in self)
 
     def descriptors(self) -> dict[int, bool]:
         """Return the descriptors to poll, see `Router.watch`."""

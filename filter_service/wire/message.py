@@ -204,7 +204,8 @@ _Path = tuple[Any, Any]
 
 def _check_depth(root: object, name: str) -> None:
     """Raise BadMessage for lists and maps that are nested too deep."""
-    level, depth = [root], 1
+    level: list[Any] = [root]
+    depth = 1
     while level:
         if depth > MAX_DEPTH:
             raise BadMessage(

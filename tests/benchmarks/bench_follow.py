@@ -9,6 +9,10 @@ and a panned photograph (`stream_walks`), at 480x270 and 30 frames a second, and
 the service; half way the eye changes.  Then, with calls that wait: the slowest frame of
 the walk against the median, and how long the first frame after a step takes (pupil 3 to
 6 mm and focus 0 to 2.5 dpt at once).  Error: the share of frames that are not whole.
+
+Rows of memory are alike on both ways: what the code says of stores, tables and buffers,
+and the PSS of every process, over 30 changes of the eye, with some frames of each.
+The process "program" includes the benchmark, its images and modules.
 Writes results/follow.json.
 """
 
@@ -28,6 +32,7 @@ from filter_service.filtering.builder import Builder
 from filter_service.filtering.stream_eyes import EyeReady
 from filter_service.rendering.native.renderer import NativeLanes
 from tests.benchmarks.harness import Row, memory_mb, publish
+from tests.benchmarks.process_memory import ManyEyes, MemoryUse, free_port
 from tests.benchmarks.published_figures import CONDITIONS
 from tests.benchmarks.stream_walks import Moment, demo_walk, photograph_walk
 
@@ -38,6 +43,9 @@ OF_OWN_RATE = 0.6
 LIMITS = BuildLimits()
 STEP = ((3.0, 0.0), (6.0, 2.5))
 WAIT_S = 120.0
+CHANGES, FRAMES_OF_EACH = 30, 12
+STATE_S = 0.6
+"""Time in which the render worker reports its memory."""
 
 
 def preset(name: str) -> dict[str, str]:
@@ -54,17 +62,15 @@ class Seen:
     n_dropped: int = 0
     times_ms: list[float] = field(default_factory=list)
     new_eye_s: float = math.inf
-    psf_count: int = 0
-    kernels_mb: float = 0.0
-    tables_mb: float = 0.0
+    memory: MemoryUse | None = None
 
     @property
     def words(self) -> str:
-        """Return the counts in words."""
+        """Return the counts and the memory in words."""
+        told = "" if self.memory is None else f", {self.memory.words}"
         return (
             f"{self.n_dropped} of {self.n_frames} dropped, new eye after "
-            f"{self.new_eye_s:.2f} s, {self.psf_count} PSFs, kernels "
-            f"{self.kernels_mb:.0f} MB, tables {self.tables_mb:.0f} MB"
+            f"{self.new_eye_s:.2f} s{told}"
         )
 
 
@@ -132,12 +138,22 @@ class Following:
             seen.n_whole += is_whole and end_s - due_s <= 2.0 / rate_hz
             if is_whole and shown.generation > 1:
                 seen.new_eye_s = min(seen.new_eye_s, end_s - changed_s)
-        for prepared in self.filter.prepared_stores:
-            store: Any = prepared.store.store
-            seen.psf_count += getattr(store, "computed_count", store.psf_count)
-            seen.kernels_mb += store.memory_mb
-            seen.tables_mb += getattr(store, "tables_mb", 0.0)
+        seen.memory = MemoryUse.of_builder(self.builder)
         return seen
+
+    def change(self, eye: str, moments: Sequence[Moment]) -> MemoryUse:
+        """Change the eye and show it some frames; return the memory."""
+        generation = self.filter.set_profile(preset(eye)).generation
+        n_left = len(moments)
+        while n_left:
+            moment = moments[-n_left]
+            found = self.filter.filter(
+                moment.view,
+                pupil_diameter_mm=moment.pupil_diameter_mm,
+                focus_dpt=moment.focus_dpt,
+            )
+            n_left -= found.generation == generation
+        return MemoryUse.of_builder(self.builder)
 
 
 def served(
@@ -147,9 +163,10 @@ def served(
     from clients.filter_client import FilterClient, FilteredFrame
     from clients.service_process import ServiceProcess
 
-    seen, sent_s = Seen(), {}
+    seen, sent_s, port = Seen(), {}, free_port()
+    settings = {"engine": "native", "metrics_port": port}
     with (
-        ServiceProcess({"engine": "native"}, start_timeout_s=WAIT_S) as service,
+        ServiceProcess(settings, start_timeout_s=WAIT_S) as service,
         FilterClient(service.endpoint, timeout_s=WAIT_S, max_in_flight=2) as client,
     ):
         client.set_profile(preset(eye), views=[moments[0].view])
@@ -187,8 +204,58 @@ def served(
         end_s = time.monotonic() + 2.0
         while client.n_unanswered and time.monotonic() < end_s:
             take(client.poll(0.01))
-        seen.kernels_mb = service.memory_mb
+        seen.memory = MemoryUse.of_service(service, port)
     return seen
+
+
+def served_changes(eyes: Sequence[str], moments: Sequence[Moment]) -> ManyEyes:
+    """Change the eye of a session as `Following.change` does."""
+    from clients.filter_client import FilterClient
+    from clients.service_process import ServiceProcess
+
+    port = free_port()
+    settings = {"engine": "native", "metrics_port": port}
+    with (
+        ServiceProcess(settings, start_timeout_s=WAIT_S) as service,
+        FilterClient(service.endpoint, timeout_s=WAIT_S) as client,
+    ):
+
+        def change(k: int) -> MemoryUse:
+            client.request_profile(preset(eyes[k]), views=[moments[0].view])
+            n_left = len(moments)
+            while n_left:
+                moment = moments[-n_left]
+                found = client.filter(
+                    moment.view,
+                    pupil_diameter_mm=moment.pupil_diameter_mm,
+                    focus_dpt=moment.focus_dpt,
+                )
+                n_left -= found.generation > k
+            time.sleep(STATE_S)
+            return MemoryUse.of_service(service, port)
+
+        return ManyEyes.of(len(eyes), change)
+
+
+def memory_rows(size_px: tuple[int, int], count: int) -> list[Row]:
+    """Rows of memory over changes of the eye."""
+    moments = photograph_walk(size_px, FRAMES_OF_EACH, 30.0)
+    eyes = [EYES[k % len(EYES)] for k in range(count)]
+    with Following(eyes[-1], moments[0].view.camera) as following:
+        here = ManyEyes.of(count, lambda k: following.change(eyes[k], moments))
+    rows = []
+    for where, found in (
+        ("in process", here),
+        ("service", served_changes(eyes, moments)),
+    ):
+        largest_mb = math.nan if found.largest_mb is None else found.largest_mb
+        rows.append(
+            _row(
+                *(f"memory, {where}", f"all eyes {size_px[0]}", found.words, []),
+                *("PSS of all processes, MB", largest_mb),
+            )
+        )
+    return rows
 
 
 def _row(method: str, case: str, setting: str, times_ms, name: str, value) -> Row:
@@ -249,13 +316,17 @@ def eye_rows(
     rows.append(
         _row("step", case, "", [took_ms], "first whole frame, s", took_ms / 1e3)
     )
-    for row in rows[-7:]:
+    _print(rows)
+    return rows
+
+
+def _print(rows: Sequence[Row]) -> None:
+    for row in rows:
         print(
             f"{row.method:22} {row.case:18} {row.error_name:22} {row.error:8.3f}  "
             f"median {row.median_ms:.1f} p95 {row.p95_ms:.1f} ms  {row.setting}",
             flush=True,
         )
-    return rows
 
 
 def main() -> None:
@@ -263,6 +334,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--quick", action="store_true", help="one eye, one size")
     parser.add_argument("--eyes", nargs="+", default=EYES, choices=EYES)
+    parser.add_argument("--memory", action="store_true", help="rows of memory only")
     parser.add_argument("--json", action="store_true", help="print the report alone")
     options = parser.parse_args()
     sizes, eyes = (SIZES[:1], EYES[:1]) if options.quick else (SIZES, options.eyes)
@@ -270,10 +342,15 @@ def main() -> None:
     rows = [
         row
         for size_px, rate_hz in sizes
-        for eye in eyes
+        for eye in ([] if options.memory else eyes)
         for row in eye_rows(eye, size_px, rate_hz, stream_s)
     ]
-    publish("follow", rows, as_json=options.json, is_whole=not options.quick)
+    for size_px, _ in sizes:
+        of_memory = memory_rows(size_px, 6 if options.quick else CHANGES)
+        _print(of_memory)
+        rows += of_memory
+    is_whole = not (options.quick or options.memory)
+    publish("follow", rows, as_json=options.json, is_whole=is_whole)
 
 
 if __name__ == "__main__":

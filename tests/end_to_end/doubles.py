@@ -28,6 +28,7 @@ class StoreDouble:
     filter_ms: float | None
     n_released: int = 0
     computed_count: int = 1
+    tables_mb: float = 0.0
 
     @property
     def memory_mb(self):
@@ -48,6 +49,7 @@ class EngineDouble:
 
     name = "numpy double"
     importer = None
+    memory_mb = 0.0
 
     def __init__(self, filter_ms: float):
         self.filter_ms = filter_ms

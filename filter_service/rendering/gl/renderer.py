@@ -62,6 +62,11 @@ class FilterRenderer(OneView):
         """
         self._eyes.drop_released()
 
+    @property
+    def memory_mb(self) -> float:
+        """Memory of the named buffers and atlases on the GPU, MB."""
+        return self._gpu.memory_mb
+
     def call_between(self, function: Callable[[], None], interval_s: float) -> bool:
         """Return False: frames on a GPU are too short for pauses."""
         return False

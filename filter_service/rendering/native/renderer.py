@@ -349,6 +349,11 @@ class NativeLanes(OneView):
         """Instruction set of the compiled loops, and their number of threads."""
         return self._main.name
 
+    @property
+    def memory_mb(self) -> float:
+        """Memory of the buffers that frames reuse, MB."""
+        return self._main.memory_mb + self._other.memory_mb
+
     def trim(self) -> None:
         """Release the buffers that frames reuse."""
         self._main.trim()
