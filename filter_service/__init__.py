@@ -16,6 +16,7 @@ Importing this package loads no submodules, which keeps clients light.
     errors           exceptions
     keys             keys of clients on other machines
     shared_memory    shared memory for images
+    heap             memory of a process, and freed memory returned to the system
     log_lines        log of the service
     validation       validation of values against annotated types
     progress         progress of long tasks on stderr

@@ -11,12 +11,15 @@ encoded with "common" and 51.2 to 53.4 with a display's own
 (tests/benchmarks/bench_displays.py).
 """
 
-from typing import Any
+from __future__ import annotations
 
-import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from typing import TYPE_CHECKING, Any
 
 from filter_service.errors import BadMessage
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import ArrayLike, NDArray
 
 DISPLAYS = {
     "common": (618.0, 536.0, 453.0),  # as in estimator.optics.units
@@ -127,6 +130,8 @@ def primaries_of_spectra(
     ValueError
         If shapes do not match, or the spectra are not three independent colors.
     """
+    import numpy as np  # here, because the service's supervisor does without it
+
     at_nm = np.asarray(wavelengths_nm, dtype=np.float64)
     power = np.asarray(spectra, dtype=np.float64)
     if at_nm.ndim != 1 or power.shape != (at_nm.size, 3):
@@ -158,6 +163,8 @@ def primary_shares(
 
     The sum over wavelengths is the identity.
     """
+    import numpy as np
+
     matching = matching_functions(wavelengths_nm)
     from_xyz = np.linalg.inv(matching.T @ spectra)
     seen_as = from_xyz @ matching.T
@@ -171,6 +178,7 @@ def matching_functions(wavelengths_nm: NDArray[np.float64]) -> NDArray[np.float6
     ----------
     Fit of Wyman, Sloan & Shirley 2013, JCGT 2(2).
     """
+    import numpy as np
 
     def lobe(center_nm: float, below_nm: float, above_nm: float) -> NDArray[Any]:
         width_nm = np.where(wavelengths_nm < center_nm, below_nm, above_nm)

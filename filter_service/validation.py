@@ -10,13 +10,13 @@ from __future__ import annotations
 
 import re
 import reprlib
+import sys
 from collections.abc import Iterator
 from functools import cache
 from itertools import pairwise
 from typing import Any, TypeVar
 
 import msgspec
-import numpy as np
 from msgspec import inspect as kinds
 
 from filter_service.errors import BadMessage
@@ -94,9 +94,8 @@ def checked(value: object, kind: type[_T], path: str = "") -> _T:
 
 def _native(value: object) -> object:
     """Return a value with NumPy numbers converted, or itself if it has none."""
-    if isinstance(value, np.generic):
-        return value.item()
-    if isinstance(value, np.ndarray):
+    numpy = sys.modules.get("numpy")  # not loaded by the supervisor: it takes 8 MB
+    if numpy is not None and isinstance(value, numpy.generic | numpy.ndarray):
         return value.tolist()
     if isinstance(value, list | tuple):
         native = [_native(item) for item in value]

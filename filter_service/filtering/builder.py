@@ -47,6 +47,7 @@ from filter_service.filtering.stream_eyes import (
     Preparing,
     StreamEyes,
 )
+from filter_service.heap import trim_heap
 from filter_service.rendering.engine import FrameEngine
 from filter_service.rendering.frame_kernels import first_frame
 from filter_service.rendering.frame_states import FrameStore
@@ -82,6 +83,9 @@ frame waited for the current batch."""
 
 PROGRESS_INTERVAL_S = 0.1
 """Minimum interval between two progress events of an eye."""
+
+TRIM_AFTER_S = 0.5
+"""Delay after which freed memory is returned to the system, which takes 1 to 10 ms."""
 
 IDLE_WAIT_S, RESTART_WAIT_S = 0.5, 0.1
 """Longest waits for the worker's next message, and while it is not running."""
@@ -135,6 +139,7 @@ class Builder:
         self._limits = limits
         self._released: list[Any] = []
         self._dropping: list[Any] = []
+        self._trim_at_s: float | None = None
         self._thread: threading.Thread | None = None
         self._is_closed = False
         self._wake = Signal()
@@ -354,6 +359,7 @@ class Builder:
                     self._lock.resume()
             if self._drop_released() or has_more:
                 continue
+            self._trim_heap()
             worker = self.worker.file_descriptor
             watched: list[Any] = (
                 [self._wake] if worker is None else [self._wake, worker]
@@ -367,8 +373,19 @@ class Builder:
         Returning half a gigabyte to the system takes 0.2 s.  By the next iteration the
         renderer has dropped its references.
         """
+        if self._dropping:
+            self._trim_at_s = time.monotonic() + TRIM_AFTER_S
         self._dropping, self._released = self._released, []
         return bool(self._dropping)
+
+    def _trim_heap(self) -> None:
+        """Return to the system what an eye took, once its successor is in use.
+
+        Between 50 and 90 MB of each eye would stay in the heap at 1280x720.
+        """
+        if self._trim_at_s is not None and time.monotonic() > self._trim_at_s:
+            self._trim_at_s = None
+            trim_heap()
 
     def _step(self) -> bool:
         """Process the worker's events, then compute a batch of PSFs.

@@ -8,7 +8,6 @@ from dataclasses import fields
 from functools import cache
 from typing import Any
 
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -48,19 +47,6 @@ reuses the computed PSFs.  A first frame of 1280x720 takes 0.3 to 0.7 s of two c
 
 FilterOf = Callable[[EyeName], EyeFilter]
 """Returns the filter of an eye."""
-
-
-@cache
-def _frame_decoder() -> msgspec.msgpack.Decoder[Frame]:
-    return msgspec.msgpack.Decoder(Frame)
-
-
-def frame_of(header: bytes) -> Frame:
-    """Return the frame, without images, of a header that the front end has validated.
-
-    This takes a third of the time of pickling the frame.
-    """
-    return _frame_decoder().decode(header)
 
 
 def filter_in_slots(

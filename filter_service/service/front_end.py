@@ -23,6 +23,7 @@ from filter_service.errors import (
     FilterError,
     NotAllowed,
 )
+from filter_service.heap import resident_memory_mb
 from filter_service.keys import KeyRing
 from filter_service.messages import (
     Bye,
@@ -64,7 +65,6 @@ from filter_service.service.metrics import MetricsUnavailable, serve_metrics
 from filter_service.service.process_channel import (
     Link,
     LinkClosed,
-    resident_memory_mb,
     start_process,
 )
 from filter_service.service.render_client import RenderClient

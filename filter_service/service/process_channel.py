@@ -9,7 +9,6 @@ from __future__ import annotations
 import ctypes
 import os
 import pickle
-import resource
 import select
 import signal
 import socket
@@ -17,8 +16,6 @@ import struct
 import sys
 from collections import deque
 from collections.abc import Sequence
-from contextlib import suppress
-from pathlib import Path
 from typing import Any, NamedTuple, Self
 
 from filter_service.log_lines import configure_logging
@@ -42,22 +39,6 @@ class WorkerMemory(NamedTuple):
     stores_mb: float = 0.0
     tables_mb: float = 0.0
     buffers_mb: float = 0.0
-
-
-def resident_memory_mb() -> float:
-    """Return the resident memory of this process (Linux; 0 elsewhere)."""
-    try:
-        pages = int(Path("/proc/self/statm").read_text().split()[1])
-    except (OSError, IndexError, ValueError):
-        return 0.0
-
-    return pages * resource.getpagesize() / 1e6
-
-
-def trim_heap() -> None:
-    """Return freed memory to the system (glibc; does nothing elsewhere)."""
-    with suppress(OSError, AttributeError):
-        ctypes.CDLL(None).malloc_trim(0)
 
 
 HEAD = struct.Struct("<QB")  # length of the message, number of descriptors

@@ -41,6 +41,7 @@ from typing import Any
 from estimator.profiles.parse import EyeProfile
 from filter_service.errors import FilterError, NoProfile, NoSession, RenderFailed
 from filter_service.filtering.builder import Builder
+from filter_service.heap import resident_memory_mb, trim_heap
 from filter_service.messages import (
     Dropped,
     ErrorReply,
@@ -52,22 +53,17 @@ from filter_service.messages import (
     SharedPlaces,
     ShareTexture,
 )
-from filter_service.service.frame_reply import (
-    filter_in_slots,
-    filter_in_textures,
-    frame_of,
-)
+from filter_service.service.frame_reply import filter_in_slots, filter_in_textures
 from filter_service.service.process_channel import (
     Link,
     LinkClosed,
     WorkerMemory,
-    resident_memory_mb,
-    trim_heap,
 )
 from filter_service.service.profile_reader import ProfileReader, ReadProfile
 from filter_service.service.session_eyes import SessionEyes
 from filter_service.shared_memory import Slot
 from filter_service.version import __version__
+from filter_service.wire.requests import frame_of
 
 IDLE_WAIT_S = 0.5
 WORKER_POLL_S = 0.1

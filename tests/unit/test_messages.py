@@ -21,8 +21,9 @@ from filter_service.messages import (
     decode_request,
     encode,
 )
-from filter_service.service.frame_reply import frame_of, images_in
+from filter_service.service.frame_reply import images_in
 from filter_service.shared_memory import Slot, aligned_starts
+from filter_service.wire.requests import frame_of
 from tests.unit.message_parts import (
     CAMERA,
     REPLIES,
