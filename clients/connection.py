@@ -125,6 +125,7 @@ class Connection:
         self.endpoint = endpoint
         self.has_failed_handshake = False
         self._n_broken_handshakes = 0
+        self._has_changed = False
         self.is_up = False
         self.state = "not connected yet"
         self.n_connections = 0
@@ -164,7 +165,8 @@ class Connection:
 
     def wait(self, timeout_s: float) -> None:
         """Wait for a message or a connection change, or until the timeout."""
-        self._poller.poll(max(0, round(timeout_s * 1000)))
+        events = self._poller.poll(max(0, round(timeout_s * 1000)))
+        self._has_changed = any(item is self._monitor for item, _ in events)
 
     @staticmethod
     def _has_message(socket: zmq.Socket[bytes]) -> bool:
@@ -172,8 +174,10 @@ class Connection:
         return bool(int(socket.get(zmq.EVENTS)) & READABLE)
 
     def changes(self) -> list[bool]:
-        """Return the connection changes since the last call; True means connected."""
-        changes = []
+        """Return the connection changes before the last wait; True means connected."""
+        changes: list[bool] = []
+        if not self._has_changed:
+            return changes
         while self._has_message(self._monitor):
             event = recv_monitor_message(self._monitor)
             kind = event["event"]

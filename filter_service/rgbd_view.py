@@ -26,7 +26,8 @@ MIN_DEPTH_M = 1e-6
 """Smaller depth counts as missing: no surface is nearer than a micrometer, and the
 reciprocals of much smaller numbers exceed float32."""
 
-COLOR_DTYPES = (np.uint8, np.float32, np.float16)
+COLOR_DTYPES = tuple(map(np.dtype, (np.uint8, np.float32, np.float16)))
+DEPTH_DTYPE = np.dtype(np.float32)
 
 
 @dataclass(frozen=True)
@@ -78,7 +79,7 @@ class RgbdView:
                 field="color",
                 allowed="uint8 sRGB, float32 or float16 linear",
             )
-        if depth_m.shape != color.shape[:2] or depth_m.dtype != np.float32:
+        if depth_m.shape != color.shape[:2] or depth_m.dtype != DEPTH_DTYPE:
             raise BadMessage(
                 f"it is {depth_m.dtype} of shape {depth_m.shape}",
                 field="depth",

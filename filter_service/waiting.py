@@ -167,9 +167,9 @@ _watcher = _Watcher()
 
 def _has_terminal() -> bool:
     """Return whether stderr is a terminal on which bars are allowed."""
-    if os.environ.get(PROGRESS_VARIABLE) == "0" or sys.stderr is None:
-        return False
     try:
-        return sys.stderr.isatty()
+        if sys.stderr is None or not sys.stderr.isatty():
+            return False
     except ValueError:  # it is closed
         return False
+    return os.environ.get(PROGRESS_VARIABLE) != "0"

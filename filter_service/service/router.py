@@ -381,12 +381,14 @@ class Router:
         if pause_s > 0.0:
             self._poller.modify(self._monitor, 0)
             timeout_s = min(timeout_s, pause_s)
-        events = self._poller.poll(max(0, math.ceil(1000 * timeout_s)))
+        events = dict(self._poller.poll(max(0, math.ceil(1000 * timeout_s))))
         if pause_s > 0.0:
             self._poller.modify(self._monitor, zmq.POLLIN)
-        self._read_monitor()
-        self._authenticator.handle_requests()
-        return {watched for watched, _ in events if isinstance(watched, int)}
+        if self._monitor in events:
+            self._read_monitor()
+        if self._authenticator.socket in events:
+            self._authenticator.handle_requests()
+        return {watched for watched in events if isinstance(watched, int)}
 
     def pop_ended(self) -> list[int]:
         """Return the numbers of the connections that have ended since the last call."""

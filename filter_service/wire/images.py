@@ -193,8 +193,8 @@ FORMATS: dict[Output, ImageFormat] = {
 }
 """Formats by their names in settings and renderers."""
 
-FORMAT_OF_DTYPE: dict[str, ImageFormat] = {
-    color.dtype: color for color in FORMATS.values()
+FORMAT_OF_DTYPE: dict[np.dtype[Any], ImageFormat] = {
+    np.dtype(color.dtype): color for color in FORMATS.values()
 }
 
 OUTPUT_OF_FORMAT: dict[ImageFormat, Output] = {
@@ -262,7 +262,7 @@ class ViewHeader(Record):
         """Return the header that describes a view."""
         return cls.of(
             view.camera,
-            FORMAT_OF_DTYPE[view.color.dtype.name],
+            FORMAT_OF_DTYPE[view.color.dtype],
             view.depth_kind,
             has_hidden=view.surface_count > 1,
             depth_encoding=depth_encoding,

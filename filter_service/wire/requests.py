@@ -176,8 +176,8 @@ class Frame(Message):
         for i, view in enumerate(self.views):
             check_camera(view.camera, f"views[{i}]", limits)
             check_part_size(view.camera, self.output, f"views[{i}]", limits)
-        states = [view.state for view in self.views]
-        check_states(states, self.state)
+        if len(self.views) > 1:
+            check_states([view.state for view in self.views], self.state)
         if self.textures:
             expect_parts(parts, 0)
             self._check_textures()
