@@ -10,6 +10,7 @@ responds while a frame is rendered, however long that takes.
 from __future__ import annotations
 
 import logging
+import pickle
 import resource
 import time
 from collections.abc import Iterable
@@ -224,7 +225,7 @@ class FrontEnd:
             self._fail_work(device)
             device.render.connect(Link.from_descriptor(descriptors[0]))
         elif message[0] == "sessions":
-            self._session_manager.restore(message[1])
+            self._session_manager.restore([pickle.loads(r) for r in message[1]])
         elif message[0] == "lost":
             self._give_up_device(self._devices[message[1]])
         elif message[0] == "recovered":
@@ -510,9 +511,13 @@ class FrontEnd:
         )
 
     def _record(self, key: str, record: SessionRecord | None) -> None:
-        """Store a session with the supervisor, for the front end after a restart."""
+        """Store a session with the supervisor, for the front end after a restart.
+
+        The supervisor gets bytes: reading them would load NumPy and libzmq there.
+        """
+        stored = None if record is None else pickle.dumps(record)
         with suppress(LinkClosed):  # this process then ends
-            self._supervisor.send(("session", key, record))
+            self._supervisor.send(("session", key, stored))
 
     def _send(self, peer: Peer, reply: Reply | list[Any]) -> Tracker | None:
         """Send a reply or its parts; disconnect a client that does not read replies."""

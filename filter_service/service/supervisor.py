@@ -160,7 +160,7 @@ class Supervisor:
         self._connected: set[int] = set()  # devices connected to the front end
         self._spawned_s = 0.0  # last start of any process
         self._restarts = {name: _Restarts() for name in self._processes}
-        self._sessions: dict[str, object] = {}  # by key, for the next front end
+        self._sessions: dict[str, bytes] = {}  # by key, for the next front end
         self._wake_reader, self._wake_writer = socket.socketpair()
         self._wake_reader.setblocking(False)
         self._wake_writer.setblocking(False)
@@ -359,7 +359,7 @@ class Supervisor:
         except LinkClosed:
             self._restart(name, process)
 
-    def _store_session(self, key: str, record: object | None) -> None:
+    def _store_session(self, key: str, record: bytes | None) -> None:
         if record is None:
             self._sessions.pop(key, None)
         else:

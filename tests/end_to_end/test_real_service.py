@@ -41,6 +41,16 @@ def real_client(real_service):
         yield client
 
 
+def test_the_supervisor_does_not_load_what_only_other_processes_need(
+    real_service, real_client
+):
+    """It did when it stored a session, 10 MB."""
+    assert real_client.welcome is not None
+    for name, is_loaded in (("supervisor", False), ("front-end", True)):
+        maps = Path(f"/proc/{real_service.pids()[name]}/maps").read_text()
+        assert [library in maps for library in ("numpy", "libzmq")] == [is_loaded] * 2
+
+
 def edge_view(width_px=160, height_px=90):
     """Return a white right half beside a black left half, 2 m away."""
     color = np.zeros((height_px, width_px, 3), np.float32)
