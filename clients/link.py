@@ -489,8 +489,7 @@ class ServiceLink:
             "age_ms": 1000 * (now_s - outgoing.submitted_s),
             "round_trip_ms": 1000 * (now_s - outgoing.sent_s),
         }
-        frame = FilteredFrame(**vars(reply) | {"colors": colors} | times_ms)
-        self._events.append(frame)
+        self._events.append(FilteredFrame.changed(reply, colors=colors, **times_ms))
 
     def _colors_in_memory(self, outgoing: Outgoing) -> tuple[NDArray[Any], ...]:
         """Return the images that the service wrote to a slot; none for textures."""

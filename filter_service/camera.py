@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Annotated, cast
 
 from msgspec import Meta
@@ -300,6 +301,24 @@ class Camera(Record):
     def pixel_count(self) -> int:
         """Return width times height."""
         return self.width_px * self.height_px
+
+
+@lru_cache(maxsize=64, typed=True)
+def _known_camera(width_px: int, height_px: int, tangents: Tangents) -> Camera:
+    return Camera(width_px, height_px, tangents)
+
+
+def camera_of(width_px: int, height_px: int, tangents: Tangents) -> Camera:
+    """Return a camera; the views of a stream have equal ones, which are checked once.
+
+    Raises
+    ------
+    BadMessage
+        As `Camera`.
+    """
+    if type(tangents) is tuple and set(map(type, tangents)) == {float}:
+        return _known_camera(width_px, height_px, tangents)
+    return Camera(width_px, height_px, tangents)
 
 
 def is_same_camera(first: Camera, second: Camera, *, follows_field: bool) -> bool:

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from filter_service.camera import Camera, Tangents
+from filter_service.camera import Camera, Tangents, camera_of
 from filter_service.errors import BadMessage
 from filter_service.settings import DEPTH_KINDS, DepthKind
 from filter_service.validation import show
@@ -112,7 +112,7 @@ class RgbdView:
     @cached_property
     def camera(self) -> Camera:
         """The camera of this view."""
-        return Camera(self.width_px, self.height_px, self.tangents)
+        return camera_of(self.width_px, self.height_px, self.tangents)
 
     @property
     def width_px(self) -> int:

@@ -5,13 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
-from filter_service.camera import Camera, SidePx, Tangents
+from filter_service.camera import Camera, SidePx, Tangents, camera_of
 from filter_service.errors import BadMessage
 from filter_service.rgbd_view import ColorImage, RgbdView
 from filter_service.settings import DepthKind, GazeDeg, Output, PupilMm, VergenceDpt
@@ -210,12 +209,6 @@ class DepthFormat(Record):
     encoding: DepthEncoding = "float32"
 
 
-@lru_cache(maxsize=64, typed=True)
-def _checked_camera(width_px: int, height_px: int, tangents: Tangents) -> Camera:
-    """Return a camera; the views of a stream have the same one, checked once."""
-    return Camera(width_px, height_px, tangents)
-
-
 @dataclass(frozen=True)
 class ViewHeader(Record):
     """Header of one view of a frame."""
@@ -292,7 +285,7 @@ class ViewHeader(Record):
     @property
     def camera(self) -> Camera:
         """Return the view's camera."""
-        return _checked_camera(self.width_px, self.height_px, self.tangents)
+        return camera_of(self.width_px, self.height_px, self.tangents)
 
     @property
     def images(self) -> tuple[tuple[str, tuple[int, ...], str], ...]:

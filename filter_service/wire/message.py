@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Annotated, Any, ClassVar, Self
 
 import msgpack
@@ -170,7 +170,13 @@ def _unpacked(
 
 def _unique_keys(pairs: list[tuple[object, object]]) -> dict[str, object]:
     """Return the pairs as a dict; raise ValueError for repeated or non-text keys."""
-    result: dict[str, object] = {}
+    try:
+        result: dict[str, object] = dict(pairs)  # type: ignore[arg-type]
+    except TypeError:  # a key is a list or a map
+        result = {}
+    if len(result) == len(pairs) and set(map(type, result)) <= {str}:
+        return result
+    result = {}
     for key, value in pairs:
         if not isinstance(key, str):
             raise ValueError(f"a key is {show(key)}, not text")
@@ -376,7 +382,9 @@ class Message(Record):
         BadMessage
             If a field is invalid; the error has its path, value and allowed values.
         """
-        given = {name: value for name, value in header.items() if name != cls.payload}
+        given = header
+        if cls.payload in header:
+            given = {name: v for name, v in header.items() if name != cls.payload}
         return checked(given, cls).with_parts(parts, limits)
 
     def with_parts(self, parts: Sequence[Part], limits: Limits) -> Self:
@@ -384,8 +392,18 @@ class Message(Record):
         expect_parts(parts, 0)
         return self
 
+    @classmethod
+    def changed(cls, message: Message, **values: object) -> Self:
+        """Return a valid message, of this type, with other values of some fields.
+
+        It is not validated again, unlike by `dataclasses.replace`.
+        """
+        found = object.__new__(cls)
+        vars(found).update(vars(message), **values)
+        return found
+
     def _with_payload(self, value: object) -> Self:
-        return replace(self, **{self.payload: value})
+        return self.changed(self, **{self.payload: value})
 
 
 def expect_parts(parts: Sequence[Part], count: int) -> None:

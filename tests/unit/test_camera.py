@@ -1,9 +1,17 @@
 """Which cameras share a store: by pixel size on axis, by the whole image off it."""
 
+import math
+
 import numpy as np
 import pytest
 
-from filter_service.camera import Camera, distinct_cameras, is_same_camera
+from filter_service.camera import (
+    Camera,
+    camera_of,
+    distinct_cameras,
+    is_same_camera,
+)
+from filter_service.errors import BadMessage
 from filter_service.rgbd_view import RgbdView, as_views
 from tests.grid_specs import grid_spec
 
@@ -80,3 +88,17 @@ def test_a_hidden_layer_is_an_array_too():
         RgbdView(COLOR, DEPTH_M, tangents, "planar", COLOR, 2.0)
     with pytest.raises(ValueError, match="hidden_color: it is a masked array"):
         RgbdView(COLOR, DEPTH_M, tangents, "planar", np.ma.array(COLOR), DEPTH_M)
+
+
+def test_a_camera_of_a_stream_is_checked_once_and_an_invalid_one_every_time():
+    tangents = (-1.0, 1.0, 0.5, -0.5)
+    assert camera_of(8, 4, tangents) == Camera(8, 4, tangents)
+    assert camera_of(8, 4, tangents) is camera_of(8, 4, tuple(tangents))
+    assert camera_of(8, 4, [-1, 1, 0.5, -0.5]) == Camera(8, 4, tangents)
+    for invalid in ((8.0, 4, tangents), (8, 4, (-1.0, True, 0.5, -0.5))):
+        for _ in range(2):
+            with pytest.raises(BadMessage):
+                camera_of(*invalid)
+    for _ in range(2):
+        with pytest.raises(BadMessage, match="tangents"):
+            camera_of(8, 4, (1.0, -1.0, 0.5, math.nan))
