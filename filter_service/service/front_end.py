@@ -24,7 +24,7 @@ from filter_service.errors import (
     FilterError,
     NotAllowed,
 )
-from filter_service.heap import resident_memory_mb
+from filter_service.heap import resident_memory_mb, trim_heap
 from filter_service.keys import KeyRing
 from filter_service.messages import (
     Bye,
@@ -295,6 +295,8 @@ class FrontEnd:
             for device in self._devices:
                 if device.frames.is_idle:
                     device.render.trim()
+            if all(device.frames.is_idle for device in self._devices):
+                trim_heap()  # of messages with images
         for device in self._devices:
             self._report_if_hung(device)
 
