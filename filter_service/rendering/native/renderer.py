@@ -78,12 +78,18 @@ class EyeStates:
         self._eyes: list[EyeState] = []
 
     def of(self, handle: NativeStore) -> EyeState:
-        """Return the state of an eye, which becomes the most recently used."""
+        """Return the state of an eye, which becomes the most recently used.
+
+        A new eye takes over the arrays of a released one.  In the first frame of a
+        cataract of 1280x720, touching new memory took 0.2 s.
+        """
         found = next((eye for eye in self._eyes if eye.handle is handle), None)
         others = [
             eye for eye in self._eyes if eye is not found and not eye.handle.is_released
         ]
-        found = found or EyeState(handle)
+        if found is None:
+            released = [eye.arrays for eye in self._eyes if eye.handle.is_released]
+            found = EyeState(handle, arrays=released[-1] if released else Arrays())
         self._eyes = [*others[1 - MAX_EYES :], found]
         return found
 
