@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
+from itertools import islice
 
 from estimator.eye.checked_fields import ProfileError
 from estimator.note import Note
@@ -16,6 +18,7 @@ from filter_service.planning.grid import GridSpec
 from filter_service.planning.nodes import PlanAxes
 from filter_service.planning.plan import PlanTooLarge, plan_axes, plan_cache
 from filter_service.psfs.eye_for_spec import eye_for_spec
+from filter_service.psfs.frame_layers import state_nodes
 from filter_service.psfs.store import PsfStore, no_psfs
 from filter_service.psfs.store_cache import StoreCache, Stored, store_key
 
@@ -77,7 +80,7 @@ def _built(
     stored = cache.load(key, check_cancelled=check_cancelled)
     if stored is not None:
         notes = (*stored.notes, Note("eye_from_cache", "eye from the disk cache"))
-        return BuiltStore(PsfStore(**stored.parts), notes)
+        return _with_parts(job, PsfStore(**stored.parts), notes)
     eye, notes = eye_for_spec(
         profile,
         spec,
@@ -100,4 +103,13 @@ def _built(
     check_cancelled()
     store = PsfStore(eye, spec, plan)
     cache.save_aside(key, Stored(store.parts, notes))
-    return BuiltStore(store, notes)
+    return _with_parts(job, store, notes)
+
+
+def _with_parts(job: BuildJob, store: PsfStore, notes: tuple[str, ...]) -> BuiltStore:
+    """Return a store with the nodes of the state of a job."""
+    built = BuiltStore(store, notes)
+    if job.near is None:
+        return built
+    count = len(state_nodes(store, job.near.clamped(job.settings)))
+    return replace(built, parts=tuple(islice(built.parts_ahead(job), count)))

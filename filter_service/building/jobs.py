@@ -67,7 +67,7 @@ class BuildJob:
     camera : Camera
     limits : BuildLimits
     near : State, optional
-        State around which nodes are planned once the store is sent; by default none.
+        State for which nodes are planned, and then others near it; by default none.
     """
 
     profile: EyeProfile
@@ -79,16 +79,30 @@ class BuildJob:
 
 @dataclass(frozen=True)
 class BuiltStore:
-    """Result of a build: a store for an engine's ``load``, and notes for the user."""
+    """Result of a build.
+
+    Attributes
+    ----------
+    store : object
+        Store for an engine's ``load``.
+    notes : tuple of str
+        Notes for the user.
+    parts : tuple
+        Parts that a first frame needs, for ``take`` of the loaded store.
+    """
 
     store: Any
     notes: tuple[str, ...] = ()
+    parts: tuple[Any, ...] = ()
 
     def parts_ahead(self, job: BuildJob) -> Iterator[Any]:
-        """Yield parts that frames will need, for ``take`` of the loaded store."""
+        """Yield more parts, those that frames near the job's state need first."""
+        from filter_service.psfs.frame_layers import state_nodes
+
         planned = getattr(self.store, "planned_ahead", None)
         if planned is not None and job.near is not None:
-            yield from planned(job.near)
+            near = job.near.clamped(job.settings)
+            yield from planned(state_nodes(self.store, near))
 
 
 Build = Callable[..., BuiltStore]

@@ -6,13 +6,14 @@ which would delay frames.
 Messages from the parent:
 
 - ``("build", ticket, job)``, ``("cancel", ticket)``
+- ``("near", ticket, state)``, to plan the nodes near a state of a built store next
 
 Messages to the parent:
 
 - ``("ready",)``, the first one
 - ``("progress", ticket, fraction, stage)``
-- ``("result", ticket, built)``, 0.3 to 2 MB, followed by ``("part", ticket, part)``,
-  0.2 to 1 MB each, until a new message arrives
+- ``("result", ticket, built)``, 0.3 to 2 MB
+- ``("part", ticket, part)``, 0.2 to 1 MB each, while there is nothing else to do
 - ``("failed", ticket, code, message, field, allowed)``
 
 Messages are pickled, which is safe because both processes belong to the service.
@@ -26,16 +27,21 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 from multiprocessing.connection import Connection
 from typing import Any
 
 from filter_service import one_blas_thread  # noqa: F401  (before any numpy)
-from filter_service.building.jobs import Build, BuildJob, to_build_error
+from filter_service.building.jobs import Build, BuildJob, BuiltStore, to_build_error
 from filter_service.errors import BuildCancelled
 from filter_service.log_lines import configure_logging
 
 PROGRESS_INTERVAL_S = 0.1
+
+MAX_STORES = 4
+"""Number of built stores whose nodes the worker still plans ahead."""
 
 log = logging.getLogger("ocufilter.worker")
 
@@ -59,13 +65,69 @@ def serve_builds(pipe: Connection, build_name: str) -> None:
     try:
         build = _import_function(build_name)
         pipe.send(("ready",))
+        requests = _Requests(pipe)
+        built: dict[int, tuple[BuiltStore, BuildJob]] = {}
+        parts: Iterator[tuple[Any, ...]] = iter(())
         while True:
-            message = pipe.recv()
-            if message[0] == "build":
-                ticket, job = message[1:]
-                _build_one(pipe, build, ticket=ticket, job=job)
+            part = None if requests.has_next() else next(parts, None)
+            if part is not None:
+                pipe.send(part)
+                continue
+            kind, ticket, argument = requests.next()
+            if kind == "build":
+                found = _build_one(requests, build, ticket=ticket, job=argument)
+                if isinstance(found, BuiltStore):
+                    kept = ticket, (replace(found, parts=()), argument)
+                    built = dict([*built.items(), kept][-MAX_STORES:])
+                    parts = _parts_ahead(found, ticket, argument)
+            elif kind == "near" and ticket in built:
+                found, job = built[ticket]
+                parts = _parts_ahead(found, ticket, replace(job, near=argument))
     except (EOFError, OSError, ParentExited):
         return
+
+
+class _Requests:
+    """Messages from the parent, in order; a build looks for its cancellation."""
+
+    def __init__(self, pipe: Connection) -> None:
+        self.pipe = pipe
+        self._waiting: deque[Any] = deque()
+
+    def has_next(self) -> bool:
+        """Return whether a message waits."""
+        return bool(self._waiting) or self.pipe.poll(0)
+
+    def next(self) -> tuple[str, int, Any]:
+        """Return the next message that is not the cancellation of an ended build."""
+        while True:
+            message = self._waiting.popleft() if self._waiting else self.pipe.recv()
+            if message[0] != "cancel":
+                kind, ticket, argument = message
+                return kind, ticket, argument
+
+    def is_cancelled(self, ticket: int) -> bool:
+        """Return whether the parent has canceled a build; takes 2 us if not."""
+        while self.pipe.poll(0):
+            try:
+                message = self.pipe.recv()
+            except (EOFError, OSError):
+                raise ParentExited from None
+            if message == ("cancel", ticket):
+                return True
+            self._waiting.append(message)
+        return False
+
+
+def _parts_ahead(
+    built: BuiltStore, ticket: int, job: BuildJob
+) -> Iterator[tuple[Any, ...]]:
+    """Yield messages with parts of a store, those near the job's state first."""
+    try:
+        for part in built.parts_ahead(job):
+            yield "part", ticket, part
+    except Exception as error:  # a frame that needs the part reports it
+        log.info("nodes could not be planned ahead: %s", error)
 
 
 def _import_function(name: str) -> Callable[..., Any]:
@@ -75,16 +137,18 @@ def _import_function(name: str) -> Callable[..., Any]:
 
 
 def _build_one(
-    pipe: Connection,
+    requests: _Requests,
     build: Build,
     *,
     ticket: int,
-    job: BuildJob,
-) -> None:
+    job: Any,
+) -> Any:
+    """Build, and send the result, which is also returned, or the failure."""
+    pipe = requests.pipe
     progress = _throttled_progress(pipe, ticket)
 
     def cancelled() -> bool:
-        return _is_cancelled(pipe, ticket)
+        return requests.is_cancelled(ticket)
 
     try:
         built = build(job, progress=progress, cancelled=cancelled)
@@ -92,17 +156,9 @@ def _build_one(
         raise
     except Exception as error:
         _send_failure(pipe, ticket, error)
-        return
+        return None
     pipe.send(("result", ticket, built))
-    try:
-        for part in built.parts_ahead(job):
-            if pipe.poll(0):  # a newer request has arrived
-                return
-            pipe.send(("part", ticket, part))
-    except OSError:
-        raise ParentExited from None
-    except Exception as error:  # a frame that needs the part reports it
-        log.info("nodes could not be planned ahead: %s", error)
+    return built
 
 
 def _throttled_progress(pipe: Connection, ticket: int) -> Callable[[float, str], None]:
@@ -117,18 +173,6 @@ def _throttled_progress(pipe: Connection, ticket: int) -> Callable[[float, str],
             pipe.send(("progress", ticket, min(max(float(fraction), 0.0), 1.0), stage))
 
     return progress
-
-
-def _is_cancelled(pipe: Connection, ticket: int) -> bool:
-    """Return whether the parent has canceled a build; takes 2 us if not."""
-    while pipe.poll(0):
-        try:
-            message = pipe.recv()
-        except (EOFError, OSError):
-            raise ParentExited from None
-        if message == ("cancel", ticket):
-            return True
-    return False
 
 
 def _send_failure(pipe: Connection, ticket: int, error: Exception) -> None:

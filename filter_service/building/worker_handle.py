@@ -17,7 +17,7 @@ from collections import deque
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from estimator.threads import THREADS_VARIABLE
 from filter_service.building.jobs import (
@@ -35,6 +35,9 @@ from filter_service.errors import (
     WorkerCrashed,
     error_from_code,
 )
+
+if TYPE_CHECKING:
+    from filter_service.view_state import State
 
 RECEIVE_BUDGET_S = 0.004
 """Time limit of one call of `poll`, which delays frames."""
@@ -171,6 +174,10 @@ class WorkerHandle:
         if ticket == self._running and self._kill_at_s is None:
             self._kill_at_s = time.monotonic() + self.cancel_grace_s
             self._send(("cancel", ticket))
+
+    def plan_near(self, ticket: int, state: State) -> None:
+        """Ask for the nodes near a state of a built store, as `BuildPart` events."""
+        self._send(("near", ticket, state))
 
     def poll(self) -> list[BuildEvent]:
         """Return new events, within a few milliseconds."""
@@ -322,6 +329,9 @@ class InlineWorker:
     def cancel(self, ticket: int) -> None:
         """Remove a queued job."""
         self._queue = deque(item for item in self._queue if item[0] != ticket)
+
+    def plan_near(self, ticket: int, state: State) -> None:
+        """Do nothing: frames plan the nodes that they need."""
 
     def poll(self) -> list[BuildEvent]:
         """Run the first queued job and return its events."""

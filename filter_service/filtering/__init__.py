@@ -7,8 +7,10 @@ replaces the previous one.  A *store* is the PSF cache of one eye for one camera
 
 eye_filter        `EyeFilter`: one stream
 planned_frame     a frame whose eyes are prepared, and `Filtered`
-stream_eyes       the profiles of a stream, their stores and events, and its frames
+stream_eyes       the profiles of a stream, their stores and events
+frame_history     the last frames of a stream, which predict the next ones
 builder           builder and engine shared by all streams
+psf_work          PSFs that are computed beside frames
 priority_lock     lock of frames and of the thread that prepares eyes
 shared_builder    builders shared within a process, and the choice of their engine
 """

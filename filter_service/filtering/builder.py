@@ -1,7 +1,7 @@
 """Builder: prepares the eyes of all streams of a process.
 
 The build worker estimates the eye of a profile, the engine loads it, and a thread
-computes the PSFs of a first frame in small batches between frames.
+computes the PSFs of a first frame, and later those of predicted states.
 """
 
 from __future__ import annotations
@@ -12,11 +12,9 @@ import threading
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, suppress
+from functools import partial
 from multiprocessing.connection import wait
 from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
 
 from estimator.profiles.parse import EyeProfile
 from filter_service.building.jobs import (
@@ -36,6 +34,11 @@ from filter_service.errors import (
     RenderFailed,
 )
 from filter_service.filtering.priority_lock import PriorityLock, Signal
+from filter_service.filtering.psf_work import (
+    PsfWork,
+    first_psfs,
+    predicted_work,
+)
 from filter_service.filtering.stream_eyes import (
     AcceptedProfile,
     BuildingEye,
@@ -62,24 +65,22 @@ EYE_PROGRESS = 0.3
 EVICTION_SHARE = 0.8
 """Eviction reduces an eye's PSFs to this share of its limit, so that it is rare."""
 
-FIRST_RANGE_S, FIRST_SHARE = (0.004, 0.08), 1.0
-"""Time that a frame leaves to the first PSFs of a new eye before the next one: this
-share of its duration, within the range.  During a stream of 1280x720 that takes both
-cores, with a worker of niceness 0, new eyes appeared after 0.7 to 1.5 s; with half of
-the time, and at most 0.03 s, after 1.1 to 2.5 s."""
+STEP_LIMIT_S, PAUSE_LIMIT_S = 0.04, 0.08
+"""Longest times that a frame waits for the next step of the thread, and that it pauses
+for its steps."""
 
-WARM_BATCH = 256
-"""PSFs per batch, 5 ms on two cores: so long a frame waits for the preparation."""
+BUILD_LEAD_S = 0.4
+"""Time after the last frame for which the nodes of a new eye are predicted."""
 
-CHECK_GROWTH = 4
-"""Factor by which each check allows more missing PSFs than the last, from `WARM_BATCH`
-on.  A new eye is ready once a check finds no more than allowed; a pupil that keeps
-moving needs new PSFs at every check."""
+CHECK_LIMIT, CHECK_GROWTH = 256, 4
+"""Number of missing PSFs that the second check allows, and the factor by which each
+later one allows more.  A new eye is ready once a check finds no more than allowed, and
+its first frame computes them; a pupil that keeps moving needs new PSFs at every
+check."""
 
 BUSY_SHARE = 0.4
-"""If frames take more than this share of the frame interval, no PSFs are predicted.  At
-0.8, on two cores, 26 to 52 % of the frames were complete instead of 49 to 73: the next
-frame waited for the current batch."""
+"""If frames take more than this share of the frame interval, PSFs are predicted only
+for states that read other nodes than the last frame."""
 
 PROGRESS_INTERVAL_S = 0.1
 """Minimum interval between two progress events of an eye."""
@@ -97,8 +98,8 @@ class Builder:
     """Builds eyes in the build worker, and computes PSFs before frames need them.
 
     A thread does both, from the first profile on.  It and the calls of the builder's
-    methods exclude each other; a call waits for one batch of PSFs at most.  The thread
-    uses no OpenGL, and no events are delivered in it.
+    methods exclude each other, except while the thread computes PSFs.  It uses no
+    OpenGL, and no events are delivered in it.
 
     Parameters
     ----------
@@ -167,8 +168,8 @@ class Builder:
 
     @contextmanager
     def frame(self) -> Iterator[None]:
-        """Exclude preparation while a frame is begun, after the time that it gets."""
-        self._lock.wait_for_reserved(FIRST_RANGE_S[1])
+        """Exclude preparation while a frame is begun, after a step that is due."""
+        self._lock.let_thread_step(STEP_LIMIT_S)
         with self.exclusive():
             yield
 
@@ -179,21 +180,13 @@ class Builder:
     def end_frame(self, stream: StreamEyes, duration_s: float) -> None:
         """Note that a frame was rendered, and deliver the events of its stream."""
         self.frame_s = duration_s
-        # A frame that interrupts another cannot wait.
-        if (
-            self._thread
-            and not self._lock.has_foreground
-            and self._to_warm() is not None
-        ):
-            low_s, high_s = FIRST_RANGE_S
-            self._lock.reserve(min(max(FIRST_SHARE * duration_s, low_s), high_s))
         if self.wakes_after_frames:
             self._wake.set()
         self.deliver(stream)
 
     def let_thread_work(self) -> None:
         """Let the thread work during a frame that pauses, if it has anything to do."""
-        self._lock.pause(FIRST_RANGE_S[1])
+        self._lock.pause(PAUSE_LIMIT_S)
 
     def trim(self) -> None:
         """Release buffers of the engine after an idle period."""
@@ -234,8 +227,13 @@ class Builder:
 
         Without a thread, this prepares eyes for a moment.
         """
-        if not self.worker.has_process and self._step():
-            timeout_s = 0.0
+        if not self.worker.has_process:
+            work, has_more = self._step()
+            if work is not None:
+                work.compute(self._lock, lambda: False)
+                self._next_work()
+            if has_more:
+                timeout_s = 0.0
         self.deliver(stream, timeout_s)
 
     # Streams
@@ -275,6 +273,7 @@ class Builder:
                 error = BuildCancelled(f"{newer} replaced profile {old.profile_id}")
                 self._emit(stream, EyeFailed(old, error))
             eye = stream.add_profile(profile, settings, cameras, profile_id=profile_id)
+            self._submit(stream)
             # Only events so far: those of the new eye follow the caller's reply.
             self.deliver(stream)
         self.prepare()
@@ -349,14 +348,14 @@ class Builder:
                 if not may_work:
                     continue
                 try:
-                    has_more = self._step()
+                    work, has_more = self._step()
                 except Exception:  # must not end the preparation of other eyes
                     log.exception("eyes could not be prepared")
-                    has_more = False
-                if self._to_warm() is None:
-                    self._lock.reserve(0.0)
-                if not has_more:
+                    work, has_more = None, False
+                if not has_more or work is not None:
                     self._lock.resume()
+            if work is not None:
+                work.compute(self._lock, lambda: self._is_closed)
             if self._drop_released() or has_more:
                 continue
             self._trim_heap()
@@ -387,12 +386,13 @@ class Builder:
             self._trim_at_s = None
             trim_heap()
 
-    def _step(self) -> bool:
-        """Process the worker's events, then compute a batch of PSFs.
+    def _step(self) -> tuple[PsfWork | None, bool]:
+        """Process the worker's events, and add the PSFs that were computed.
 
-        Returns whether more PSFs can be computed now.
+        Returns the PSFs to compute next, and whether there is more to do after them.
         """
-        for event in self.worker.poll():
+        events = self.worker.poll()
+        for event in events:
             self._count_advance(event)
             if isinstance(event, BuildPart):
                 self._add_part(event)
@@ -402,30 +402,45 @@ class Builder:
             if stream is not None:
                 self._handle(stream, event)
         for stream in list(self.streams):
-            following = stream.next_build()
-            if stream.building is None and following is not None:
-                stream.building = following
-                stream.ticket = self.worker.submit(
-                    BuildJob(
-                        profile=following.eye.profile,
-                        settings=following.eye.settings,
-                        camera=following.camera,
-                        limits=self._limits,
-                        near=_likely_state(stream, following),
-                    )
-                )
-        found = self._to_warm()
+            self._submit(stream)
+        if self._thread and any(isinstance(event, BuildDone) for event in events):
+            return None, True  # a frame may go first: loading took 10 ms
+        found = self._next_work()
+        self._limit_memory()
+        return found
+
+    def _next_work(self) -> tuple[PsfWork | None, bool]:
+        """Add the PSFs that were computed; return the next ones, as `_step`."""
+        found, work = self._to_warm(), None
         if found is not None:
             self._warm_first(*found)
             _, _, prepared = found
+            work = prepared.work
             n_computed = prepared.store.computed_count
             # Not those that were evicted and are computed again, without end.
             if n_computed > prepared.n_most_computed:
                 prepared.n_most_computed = n_computed
                 self.n_advances += 1
-        has_more = found is not None or any(map(self._warm_ahead, self.streams))
-        self._limit_memory()
-        return has_more
+        else:
+            works = map(self._warm_ahead, list(self.streams))
+            work = next((one for one in works if one is not None), None)
+        return work, found is not None or work is not None
+
+    def _submit(self, stream: StreamEyes) -> None:
+        """Submit the next build of a stream to the worker, unless one is running."""
+        following = stream.next_build()
+        if stream.building is not None or following is None:
+            return
+        stream.building = following
+        stream.ticket = self.worker.submit(
+            BuildJob(
+                profile=following.eye.profile,
+                settings=following.eye.settings,
+                camera=following.camera,
+                limits=self._limits,
+                near=_likely_state(stream, following),
+            )
+        )
 
     def _to_warm(self) -> tuple[StreamEyes, AcceptedProfile, PreparedStore] | None:
         """Return a stream, its newest eye and a store of that that is not ready."""
@@ -461,6 +476,8 @@ class Builder:
                 *(target.camera, loaded, target.eye.accepted_s, event.built.notes),
                 ticket=event.ticket,
             )
+            for part in event.built.parts:
+                loaded.add_part(part)
             stream.add_store(target.eye, prepared)
         elif isinstance(event, BuildError):
             self._fail(stream, target, event.error)
@@ -479,40 +496,41 @@ class Builder:
         eye: AcceptedProfile,
         prepared: PreparedStore,
     ) -> None:
-        """Compute a batch of the PSFs of a first frame."""
-        store, use = prepared.store, stream.history.last
-        is_all = eye.settings.prepare == "ranges"
+        """Add PSFs of a first frame that were computed, or look for missing ones."""
+        store = prepared.store
         try:
-            if not prepared.pending.size:
-                use = use or first_frame(prepared.camera, eye.settings)
-                prepared.pending = store.missing_psfs(None if is_all else use)
-                prepared.n_missing = prepared.pending.size
-            if prepared.n_missing:
-                self._report_progress(stream, eye, prepared)
-                prepared.pending = _without_batch(store, prepared.pending)
-                if prepared.pending.size:
+            if prepared.work is not None:
+                prepared.work.add()
+                self._report_progress(stream, eye, prepared, prepared.work)
+                if prepared.work.left.size:
                     return
-                # Pupil and focus may have changed meanwhile, so check again.
-                prepared.n_checks += 1
-                if prepared.n_missing > WARM_BATCH * CHECK_GROWTH ** (
-                    prepared.n_checks - 1
-                ):
-                    return
+            # Pupil and focus may have changed meanwhile, so check again.
+            psfs = first_psfs(store, prepared.camera, eye.settings, stream.history)
+            prepared.work = PsfWork(store, psfs) if psfs.size else None
+            n_checks, prepared.n_checks = prepared.n_checks, prepared.n_checks + 1
+            if psfs.size > _allowed_missing(n_checks):
+                return
+            prepared.work = None
         except Exception as error:  # must not affect other streams
+            prepared.work = None
             target = BuildTarget(eye, prepared.camera)
             self._fail(stream, target, _to_filter_error(error))
             return
         self._set_ready(stream, eye, prepared)
 
     def _report_progress(
-        self, stream: StreamEyes, eye: AcceptedProfile, prepared: PreparedStore
+        self,
+        stream: StreamEyes,
+        eye: AcceptedProfile,
+        prepared: PreparedStore,
+        work: PsfWork,
     ) -> None:
         now_s = time.monotonic()
         if now_s < prepared.next_progress_s:
             return
         prepared.next_progress_s = now_s + PROGRESS_INTERVAL_S
         n_computed = prepared.store.computed_count
-        share = n_computed / (n_computed + prepared.pending.size)
+        share = n_computed / max(n_computed + work.left.size, 1)
         fraction = EYE_PROGRESS + (1.0 - EYE_PROGRESS) * share
         self._emit(stream, BuildingEye(eye, fraction, "psfs"))
 
@@ -541,27 +559,32 @@ class Builder:
         )
         stream.set_ready(eye, prepared)
 
-    def _warm_ahead(self, stream: StreamEyes) -> bool:
-        """Compute PSFs of a stream's predicted states; return whether some are left."""
+    def _warm_ahead(self, stream: StreamEyes) -> PsfWork | None:
+        """Add PSFs of predicted states that were computed; return those to compute."""
         prepared, last = stream.store_in_use(), stream.history.last
-        if prepared is None or last is None or last is stream.history.last_warmed:
-            return False
-        if self.frame_s > BUSY_SHARE * stream.history.interval_s:
-            return False
-        store = prepared.store
+        if prepared is None or last is None:
+            return None
+        work = prepared.work
         try:
-            for state in stream.history.predicted_states():
-                left = store.missing_psfs(last, state=state)
-                while left.size:
-                    left = _without_batch(store, left)
-                    if self._lock.has_foreground:  # their frame may need other PSFs
-                        return True
+            if work is not None:
+                work.add()
+                if work.left.size:
+                    return work
+            prepared.work = None
+            if last is not stream.history.last_predicted:
+                stream.history.last_predicted = last
+                is_busy = self.frame_s > BUSY_SHARE * stream.history.interval_s
+                prepared.work = predicted_work(
+                    *(prepared.store, stream.history, prepared.predicted),
+                    partial(self.worker.plan_near, prepared.ticket),
+                    is_busy=is_busy,
+                )
         except Exception as error:  # a frame that needs the PSFs reports it
+            prepared.work = None
             log.info(
                 "predicted PSFs could not be computed: %s", _to_filter_error(error)
             )
-        stream.history.last_warmed = last
-        return False
+        return prepared.work
 
     def _limit_memory(self) -> None:
         """Evict PSFs of the least recently used eyes beyond ``max_stores_mb``."""
@@ -584,16 +607,15 @@ class Builder:
         stream.fail_build(target.eye, target.camera, error)
 
 
-def _without_batch(store: FrameStore, psfs: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Compute a batch of PSFs (n,); return the others."""
-    left = store.fill(psfs[:WARM_BATCH], until_s=0.0, batch_count=WARM_BATCH)
-    return np.concatenate([left, psfs[WARM_BATCH:]])
+def _allowed_missing(n_checks: int) -> int:
+    """Return how many PSFs of a first frame may be missing after earlier checks."""
+    return CHECK_LIMIT * CHECK_GROWTH ** (n_checks - 1) if n_checks else 0
 
 
 def _likely_state(stream: StreamEyes, target: BuildTarget) -> State:
-    """Return the likely pupil and focus of the next frame."""
+    """Return the likely pupil and focus of the first frame through a new eye."""
     use = stream.history.last or first_frame(target.camera, target.eye.settings)
-    return use.state
+    return stream.history.predicted(BUILD_LEAD_S) or use.state
 
 
 def _to_filter_error(error: Exception) -> FilterError:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import threading
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 
@@ -53,10 +52,9 @@ class PriorityLock:
         self._calls: set[object] = set()  # that hold the lock or wait for it
         self._is_free = threading.Event()  # for the thread
         self._is_free.set()
-        self._is_paused = self._is_thread_waiting = False
-        self._reserved_s = 0.0
-        self._is_used = threading.Event()  # the reserved time
-        self._is_used.set()
+        self._is_paused = False
+        self._is_thread_served = threading.Event()  # it does not wait for the lock
+        self._is_thread_served.set()
 
     @contextmanager
     def foreground(self) -> Iterator[None]:
@@ -75,41 +73,31 @@ class PriorityLock:
     @contextmanager
     def background(self) -> Iterator[bool]:
         """Hold the lock during a step of the thread; yield whether it may work."""
-        self._is_thread_waiting = True
+        self._is_thread_served.clear()
         self._is_free.wait(WAIT_S)
         with self._lock:
             if self._calls and not self._is_paused:
                 yield False
                 return
-            self._is_thread_waiting, started_s = False, time.monotonic()
+            self._is_thread_served.set()
             yield True
-            self._reserved_s -= time.monotonic() - started_s
-            if self._reserved_s <= 0.0:
-                self._is_used.set()
-
-    def reserve(self, time_s: float) -> None:
-        """Reserve time for the thread, which `wait_for_reserved` waits for."""
-        self._reserved_s = time_s
-        if time_s > 0.0:
-            self._is_used.clear()
-        else:
-            self._is_used.set()
 
     @property
     def has_foreground(self) -> bool:
         """Return whether a call holds the lock or waits for it."""
         return bool(self._calls)
 
-    def wait_for_reserved(self, timeout_s: float) -> None:
-        """Wait until the thread has used its reserved time.
+    def let_thread_step(self, timeout_s: float) -> None:
+        """Let the thread take the step that it waits for, before a call.
 
         Otherwise calls in close succession would leave it no time.
         """
-        self._is_used.wait(timeout_s)
+        if not self._calls:  # which do not end before this returns
+            self._is_thread_served.wait(timeout_s)
 
     def pause(self, timeout_s: float) -> None:
         """Let the thread work in the middle of a call, if it is waiting."""
-        if not self._is_thread_waiting:
+        if self._is_thread_served.is_set():
             return
         with self._lock:
             self._is_paused = True

@@ -1,37 +1,26 @@
 """The eyes of one stream: the newest one, and the previous one until it is ready.
 
-A profile is requested, then building, then ready.  This module only holds the state,
-with the last frames of the stream; `builder` acts on it.
+A profile is requested, then building, then ready.  This module only holds the state;
+`builder` acts on it.
 """
 
 from __future__ import annotations
 
 import time
-from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from queue import SimpleQueue
 from typing import Any, Literal, NamedTuple
 from weakref import WeakSet
 
-import numpy as np
-from numpy.typing import NDArray
-
 from estimator.profiles.parse import EyeProfile
 from filter_service.camera import Camera, distinct_cameras, is_same_camera
 from filter_service.errors import FilterError, NoProfile
-from filter_service.rendering.frame_kernels import SampledFrame, SampledView
+from filter_service.filtering.frame_history import FrameHistory
+from filter_service.filtering.psf_work import PredictedNodes, PsfWork
 from filter_service.rendering.frame_states import FrameStore
 from filter_service.rendering.media_effects import MediaEffects
-from filter_service.rgbd_view import RgbdView
 from filter_service.settings import FilterSettings
-from filter_service.view_state import State
-
-SPEED_S = 0.25
-"""Interval over which the speed of pupil and focus is measured."""
-
-LEAD_S = (0.1, 0.3)
-"""Prediction horizons: the next frame, and later ones."""
 
 
 @dataclass(eq=False)
@@ -50,12 +39,12 @@ class PreparedStore:
         Whether the PSFs of a first frame are computed, so that frames use the store.
     last_used_s : float
         Time when a frame last used it, or when it was loaded.
-    pending : (n,)
-        Indices of the PSFs of a first frame that are being computed.
+    work : PsfWork, optional
+        PSFs that are being computed: of a first frame, then of predicted states.
+    predicted : PredictedNodes
+        Nodes of predicted states.
     next_progress_s : float
         Earliest time of the next progress event.
-    n_missing : int
-        Number of PSFs that the last check found to be missing.
     n_checks : int
         Number of completed checks for missing PSFs of a first frame.
     n_most_computed : int
@@ -70,9 +59,9 @@ class PreparedStore:
     notes: tuple[str, ...] = ()
     is_ready: bool = False
     last_used_s: float = field(default_factory=time.monotonic)
-    pending: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+    work: PsfWork | None = None
+    predicted: PredictedNodes = field(default_factory=PredictedNodes)
     next_progress_s: float = 0.0
-    n_missing: int = 0
     n_checks: int = 0
     n_most_computed: int = 0
     ticket: int = 0
@@ -235,68 +224,6 @@ class EyeFailed:
 
 
 EyeEvent = BuildingEye | EyeReady | EyeFailed
-
-
-class FrameHistory:
-    """The last frames of a stream, which predict pupil and focus of the next ones.
-
-    PSFs of predicted states are computed between frames, which saves time in the next
-    one.  A wrong prediction cannot change an image.
-    """
-
-    def __init__(self) -> None:
-        self._states: deque[tuple[float, State]] = deque()
-        self.last: SampledFrame | None = None
-        self.last_warmed: SampledFrame | None = None  # last with computed predictions
-
-    def record(
-        self,
-        views: Sequence[RgbdView],
-        state: State,
-        *,
-        at_s: float,
-    ) -> None:
-        """Add a frame that arrived at ``at_s``."""
-        seen = tuple(SampledView.of(view) for view in views)
-        self.record_sampled(lambda: seen, state, at_s=at_s)
-
-    def record_sampled(
-        self,
-        sample: Callable[[], tuple[SampledView, ...]],
-        state: State,
-        *,
-        at_s: float,
-    ) -> None:
-        """Add a frame, whose views are sampled only if PSFs are computed for them."""
-        self.last = SampledFrame(at_s, state, sample)
-        self._states.append((at_s, state))
-        while self._states[0][0] < at_s - SPEED_S and len(self._states) > 2:
-            self._states.popleft()
-
-    @property
-    def interval_s(self) -> float:
-        """Return the mean interval of the last frames; 0 before the second."""
-        if len(self._states) < 2:
-            return 0.0
-        return (self._states[-1][0] - self._states[0][0]) / (len(self._states) - 1)
-
-    def predicted_states(self) -> list[State]:
-        """Return the linearly extrapolated pupil and focus at each horizon."""
-        if len(self._states) < 2:
-            return []
-        (first_s, first), (last_s, last) = self._states[0], self._states[-1]
-        if last_s - first_s < 1e-3:
-            return []
-        found = []
-        for lead_s in LEAD_S:
-            steps = lead_s / (last_s - first_s)
-            pupil_mm, focus_dpt = (
-                getattr(last, name)
-                + steps * (getattr(last, name) - getattr(first, name))
-                for name in ("pupil_diameter_mm", "focus_dpt")
-            )
-            found.append(State(pupil_mm, focus_dpt))
-        return found
 
 
 class BuildTarget(NamedTuple):

@@ -55,17 +55,23 @@ class PsfEngine:
 
 
 @cache
-def psf_engine(pipeline: str = "exact") -> PsfEngine:
+def psf_engine(pipeline: str = "exact", threads: int | None = None) -> PsfEngine:
     """Return the engine of a pipeline.
 
     "exact" uses the compiled engine.  "published" uses the ENZ series up to the paper's
     Zernike degree, even where the aberrations require a higher one.  Its PSFs take up
     to 0.25 s of a core, so there is one for each thread between two checks.
+
+    Parameters
+    ----------
+    pipeline : "exact" or "published"
+    threads : int, optional
+        Number of threads of the compiled engine; by default one for each core.
     """
     if pipeline == "published":
         series = partial(compute_psf_batch, method="enz_unchecked")
         return PsfEngine(series, thread_count())
-    return PsfEngine(compute_psf_batch, NATIVE_BATCH, native_psfs())
+    return PsfEngine(compute_psf_batch, NATIVE_BATCH, native_psfs(threads))
 
 
 def computed_kernels(

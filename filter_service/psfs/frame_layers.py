@@ -25,7 +25,7 @@ from filter_service.planning.grid import (
 from filter_service.planning.nodes import PlanAxes, usable_pupils_mm
 from filter_service.psfs.field_defocus import FieldDefocus
 from filter_service.psfs.pack import StateReads, StoreTables, layer_blur_px
-from filter_service.psfs.store import PsfStore
+from filter_service.psfs.store import PsfStore, StateNode
 from filter_service.view_state import State
 
 CURVE_MARGIN_DPT = 1.0
@@ -172,6 +172,16 @@ def frame_layers(
         notes=notes,
         merge_spread_px=merge_spread_px,
     )
+
+
+def state_nodes(store: PsfStore, state: State) -> tuple[StateNode, ...]:
+    """Return the nodes of pupil and accommodation that frames of a state read."""
+    pupil_mm, _ = _usable_pupil(store, state.pupil_diameter_mm)
+    accommodation_dpt = store.eye.accommodation_dpt(
+        state.focus_dpt, pupil_diameter_mm=pupil_mm
+    )
+    corners = _corners(store.plan, pupil_mm, accommodation_dpt)
+    return tuple(corner[:2] for corner in corners)
 
 
 def _layer_zero_dpt(

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
@@ -186,6 +186,9 @@ class NativePsfs:
 
 
 @cache
-def native_psfs() -> NativePsfs:
-    """Return the engine of this process."""
-    return NativePsfs(compiled_psfs())
+def native_psfs(threads: int | None = None) -> NativePsfs:
+    """Return the engine of this process on all of its threads, or on so many."""
+    engine = compiled_psfs()
+    if threads is not None:
+        engine = replace(engine, threads=engine.core.new_threads(threads))
+    return NativePsfs(engine)

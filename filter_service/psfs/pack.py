@@ -8,6 +8,7 @@ engine in C packs its own kernels; this module packs kernels of other engines.
 from __future__ import annotations
 
 import math
+from collections import Counter
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -79,6 +80,27 @@ class PackedKernels:
     spread_px: NDArray[np.float64]
     lost_energy_ratio: NDArray[np.float64]
 
+    def select(self, places: NDArray[np.int64]) -> PackedKernels:
+        """Return the kernels at ``places``."""
+        widths, heights = box_sizes(self.reach_px[places])
+        starts, sizes = self.offsets[places], widths * heights
+        own = [
+            self.weights[start : start + size]
+            for start, size in zip(starts.tolist(), sizes.tolist(), strict=True)
+        ]
+        arrays = {
+            name: getattr(self, name)[places]
+            for name in (
+                *("reach_px", "radius_px"),
+                *("peak_ratio", "spread_px", "lost_energy_ratio"),
+            )
+        }
+        return PackedKernels(
+            weights=np.concatenate([self.weights[:0], *own]),
+            offsets=np.cumsum(sizes) - sizes,
+            **arrays,
+        )
+
     def with_kernels(
         self, places: NDArray[np.int64], others: PackedKernels
     ) -> PackedKernels:
@@ -96,6 +118,24 @@ class PackedKernels:
         return replace(
             self, weights=np.concatenate([self.weights, others.weights]), **arrays
         )
+
+
+class ComputedPsfs(NamedTuple):
+    """Kernels that are computed but not in a store yet.
+
+    Attributes
+    ----------
+    psfs : (n,)
+        PSF indices.
+    packed : PackedKernels
+        Kernels (n,).
+    methods : Counter
+        Number of PSFs by method.
+    """
+
+    psfs: NDArray[np.int64]
+    packed: PackedKernels
+    methods: Counter[str]
 
 
 def pack_kernels(batch: PsfBatch, *, kept_energy_ratio: float) -> PackedKernels:

@@ -27,8 +27,12 @@ from filter_service.errors import (
 from filter_service.planning.grid import GridSpec
 from filter_service.planning.nodes import CachePlan, PlanAxes, PlanNodes
 from filter_service.psfs.field_defocus import EyeDefocus
-from filter_service.psfs.pack import StoreTables, pack_reach, unpack_reach
-from filter_service.view_state import State
+from filter_service.psfs.pack import (
+    ComputedPsfs,
+    StoreTables,
+    pack_reach,
+    unpack_reach,
+)
 
 if TYPE_CHECKING:
     from estimator.profiles.parse import EyeProfile
@@ -104,6 +108,7 @@ class PsfStore:
         self.tables = StoreTables.empty()
         self._first_groups: dict[StateNode, int] = {}
         self._ahead: dict[StateNode, PlanNodes] = {}
+        self._sent: set[StateNode] = set()  # by `planned_ahead`
         self.methods: Counter[str] = Counter()
         self.max_lost_energy_ratio = 0.0
         self.build_ms = 0.0
@@ -113,7 +118,7 @@ class PsfStore:
         self._n_words = 0
         self._added: list[NDArray[np.int64]] = []
         self.step_curves: dict[StateNode, NDArray[np.float64]] = {}
-        self._rings: NodeRings | None = None
+        self._rings: tuple[PlanNodes, NodeRings] | None = None
         if isinstance(plan, CachePlan):
             self._add_nodes(self._states, plan.nodes)
 
@@ -179,33 +184,30 @@ class PsfStore:
         planned = self._ahead.pop(state, None)
         return self._planner.nodes(*state) if planned is None else planned
 
-    def planned_ahead(self, near: State) -> Iterator[tuple[StateNode, PlanNodes]]:
-        """Plan states that no frame has read yet, for `take` of an equal store.
+    def planned_ahead(
+        self, first: Sequence[StateNode]
+    ) -> Iterator[tuple[StateNode, PlanNodes]]:
+        """Plan states that were not planned yet, for `take` of an equal store.
 
         The worker process calls this.  In the rendering process, planning a state would
         delay the first frame that reads it by 12 to 30 ms.
 
         Parameters
         ----------
-        near : State
-            State whose neighbors are planned first.
+        first : sequence of StateNode
+            States that are planned first, followed by others near them.
         """
-        pupil_mm = near.pupil_diameter_mm
-        accommodation_dpt = self.eye.accommodation_dpt(
-            near.focus_dpt, pupil_diameter_mm=self.eye.usable_pupil_mm(pupil_mm)
-        )
-        plan = self.plan
-        at = (
-            np.interp(pupil_mm, plan.pupils_mm, np.arange(len(plan.pupils_mm))),
-            np.interp(
-                accommodation_dpt,
-                plan.accommodations_dpt,
-                np.arange(len(plan.accommodations_dpt)),
-            ),
-        )
-        left = [state for state in self._states if state not in self._first_groups]
-        for state in sorted(left, key=lambda s: np.hypot(s[0] - at[0], s[1] - at[1])):
+        middle, known = np.mean(first, axis=0), {*self._first_groups, *self._sent}
+        for state in sorted(
+            (state for state in self._states if state not in known),
+            key=lambda state: (state not in first, np.hypot(*(state - middle))),
+        ):
+            self._sent.add(state)
             yield state, self._planner.nodes(*state)
+
+    def is_planned(self, states: Sequence[StateNode]) -> bool:
+        """Return whether all states are planned, by this process or the worker."""
+        return all(s in self._first_groups or s in self._ahead for s in states)
 
     def take(self, planned: tuple[StateNode, PlanNodes]) -> None:
         """Keep the nodes of a state that was planned ahead until a frame reads it."""
@@ -232,7 +234,6 @@ class PsfStore:
             first += self.fields_count
         # Frames in progress may still read the old arrays.
         self.nodes, self.tables = new, self.tables.grown(new)
-        self._rings = None
 
     # Kernels
 
@@ -274,19 +275,13 @@ class PsfStore:
         OutOfMemory
             If the kernels of a frame exceed ``spec.memory_budget_mb``.
         """
-        from filter_service.psfs.compute_kernels import computed_kernels, psf_engine
-
-        self.engine = self.engine or psf_engine(self.spec.settings.pipeline)
         started_s = time.perf_counter()
         if psfs is None:
             self.plan_all()
             psfs = np.arange(self.psf_count)
-        psfs = np.unique(psfs)
-        if not self.spec.settings.chromatic:  # channels share kernels
-            psfs = RGB * np.unique(psfs // RGB)
-        psfs = psfs[~self.tables.is_computed[psfs]]
+        psfs = self.not_computed(psfs)
         left = psfs[:0]
-        step = self.engine.batch_count
+        step = self._own_engine().batch_count
         step = min(batch_count or step, step)
         batches = np.array_split(psfs, -(-psfs.size // step) or 1)
         for number, batch in enumerate(batches):
@@ -294,15 +289,7 @@ class PsfStore:
             batch = batch[~self.tables.is_computed[batch]]
             if not batch.size:
                 continue
-            with self._client_errors():
-                packed, methods = computed_kernels(
-                    *(self.eye, self.spec, self.nodes),
-                    *(batch, self.engine, self._node_rings()),
-                )
-            self.methods += methods
-            if not self.spec.settings.chromatic:
-                batch = batch + np.arange(RGB)[:, None]
-            self._append(batch, packed)
+            self.add(self.computed(batch))
             if progress is not None:
                 progress((number + 1) / len(batches))
             if number + 1 == len(batches):
@@ -315,13 +302,73 @@ class PsfStore:
         self.build_ms += 1e3 * (time.perf_counter() - started_s)
         return left
 
-    def _node_rings(self) -> NodeRings | None:
+    def not_computed(self, psfs: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return the distinct PSFs (m,) among others (n,) that `computed` may get."""
+        psfs = np.unique(psfs)
+        if not self.spec.settings.chromatic:  # channels share kernels
+            psfs = RGB * np.unique(psfs // RGB)
+        return psfs[~self.tables.is_computed[psfs]]
+
+    def computed(
+        self, psfs: NDArray[np.int64], *, thread_count: int | None = None
+    ) -> ComputedPsfs:
+        """Compute kernels without changing the store, which other threads may use.
+
+        Parameters
+        ----------
+        psfs : (n,)
+            Result of `not_computed`, or a part of it.
+        thread_count : int, optional
+            Number of threads; by default one for each core.
+
+        Raises
+        ------
+        GridTooLarge
+            If a kernel exceeds ``spec.max_blur_radius_px``.
+        BuildFailed
+            If no PSF can be computed for a state of the eye.
+        """
+        from filter_service.psfs.compute_kernels import computed_kernels
+
+        nodes = self.nodes
+        with self._client_errors():
+            packed, methods = computed_kernels(
+                *(self.eye, self.spec, nodes, psfs),
+                *(self._own_engine(thread_count), self._node_rings(nodes)),
+            )
+        return ComputedPsfs(psfs, packed, methods)
+
+    def add(self, found: ComputedPsfs) -> None:
+        """Add kernels, except those that were computed meanwhile.
+
+        Raises
+        ------
+        OutOfMemory
+            If the kernels of a frame exceed ``spec.memory_budget_mb``.
+        """
+        psfs, packed, methods = found
+        is_new = ~self.tables.is_computed[psfs]
+        if not is_new.all():
+            psfs, packed = psfs[is_new], packed.select(np.flatnonzero(is_new))
+        self.methods += methods
+        if not self.spec.settings.chromatic:
+            psfs = psfs + np.arange(RGB)[:, None]
+        self._append(psfs, packed)
+
+    def _own_engine(self, thread_count: int | None = None) -> PsfEngine:
+        from filter_service.psfs.compute_kernels import psf_engine
+
+        return self.engine or psf_engine(self.spec.settings.pipeline, thread_count)
+
+    def _node_rings(self, nodes: PlanNodes) -> NodeRings | None:
         """Return the rings of the eye's lens, tabulated on first use, or None."""
         from filter_service.psfs.native_psfs import NodeRings
 
-        if self._rings is None and self.eye.rings is not None:
-            self._rings = NodeRings.of(self.eye.rings, self.nodes.wavefronts)
-        return self._rings
+        if self.eye.rings is None:
+            return None
+        if self._rings is None or self._rings[0] is not nodes:
+            self._rings = nodes, NodeRings.of(self.eye.rings, nodes.wavefronts)
+        return self._rings[1]
 
     @contextmanager
     def _client_errors(self) -> Iterator[None]:

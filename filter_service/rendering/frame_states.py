@@ -21,8 +21,9 @@ from filter_service.errors import OutOfMemory
 from filter_service.planning.node_wavefronts import apodization
 from filter_service.psfs.exact_store import ExactStore
 from filter_service.psfs.field_defocus import FieldAxes
-from filter_service.psfs.frame_layers import FrameLayers, frame_layers
-from filter_service.psfs.store import PsfStore
+from filter_service.psfs.frame_layers import FrameLayers, frame_layers, state_nodes
+from filter_service.psfs.pack import ComputedPsfs
+from filter_service.psfs.store import PsfStore, StateNode
 from filter_service.rendering.frame import merge_spread_px
 from filter_service.rendering.frame_kernels import SampledFrame, missing_psfs_of
 from filter_service.rendering.image_cells import ImageCells, image_cells, stored_scale
@@ -263,11 +264,27 @@ class FrameStore:
             return np.flatnonzero(~self.store.tables.is_computed)
         return missing_psfs_of(self.store, frame, self._cells_at, state=state)
 
-    def fill(
-        self, psfs: NDArray[np.int64], *, until_s: float, batch_count: int
-    ) -> NDArray[np.int64]:
-        """Compute PSFs, see `PsfStore.fill`."""
-        return self.store.fill(psfs, until_s=until_s, batch_count=batch_count)
+    def not_computed(self, psfs: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return the PSFs (m,) to compute, see `PsfStore.not_computed`."""
+        return self.store.not_computed(psfs)
+
+    def computed(
+        self, psfs: NDArray[np.int64], *, thread_count: int | None = None
+    ) -> ComputedPsfs:
+        """Compute PSFs for `add`, see `PsfStore.computed`."""
+        return self.store.computed(psfs, thread_count=thread_count)
+
+    def add(self, found: ComputedPsfs) -> None:
+        """Add computed PSFs, see `PsfStore.add`."""
+        self.store.add(found)
+
+    def state_nodes(self, state: State) -> tuple[StateNode, ...]:
+        """Return the nodes of pupil and accommodation that frames of a state read."""
+        return state_nodes(self.store, state.clamped(self.store.spec.settings))
+
+    def is_planned(self, nodes: tuple[StateNode, ...]) -> bool:
+        """Return whether the PSFs of these nodes are planned."""
+        return self.store.is_planned(nodes)
 
     def add_part(self, part: Any) -> None:
         """Add a part of the plan that the worker has prepared."""
@@ -336,6 +353,7 @@ class FrameStore:
     def evict(self, max_mb: float) -> None:
         """Evict the least recently used PSFs, see `PsfStore.evict`."""
         self._release_exact()
+        self.store.frame_number += 1  # between frames, no PSFs are in use
         self.store.evict(int(max_mb * 1e6 / self.store.kernels.itemsize))
 
     def _cells_at(self, gaze_deg: tuple[float, float]) -> ImageCells:

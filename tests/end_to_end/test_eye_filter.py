@@ -319,7 +319,7 @@ def test_psfs_that_cannot_be_computed_fail_their_eye_alone(monkeypatch, rng):
 
         eye_filter.set_profile("keratoconus")
         with monkeypatch.context() as broken:
-            broken.setattr(FrameStore, "fill", fail)
+            broken.setattr(FrameStore, "computed", fail)
             with pytest.raises(RenderFailed, match="FloatingPointError: not foreseen"):
                 eye_filter.wait(20.0)
         assert isinstance(events[-1], EyeFailed)

@@ -2,7 +2,9 @@
 
 import pickle
 import time
+from contextlib import nullcontext
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,10 +14,20 @@ from filter_service.building.jobs import BuildDone, BuildError, BuildJob, BuildP
 from filter_service.building.worker_handle import WorkerHandle
 from filter_service.camera import Camera
 from filter_service.errors import BuildFailed, OutOfMemory
+from filter_service.filtering import psf_work
+from filter_service.filtering.frame_history import FrameHistory
+from filter_service.filtering.priority_lock import PriorityLock
+from filter_service.filtering.psf_work import (
+    BATCH,
+    SPREAD_BATCH,
+    PredictedNodes,
+    PsfWork,
+    predicted_work,
+)
 from filter_service.planning.cost import states_of
 from filter_service.planning.node_wavefronts import state_survey
 from filter_service.planning.plan import plan_axes, unchecked_plan
-from filter_service.psfs.frame_layers import frame_layers
+from filter_service.psfs.frame_layers import frame_layers, state_nodes
 from filter_service.psfs.store import PsfStore, build_psf_store
 from filter_service.rendering.frame_kernels import (
     MissingPsfs,
@@ -134,8 +146,9 @@ def test_nodes_planned_ahead_serve_frames_as_they_would_plan_them(
     from filter_service.rendering.native import NativeRenderer
 
     pupil_mm, focus_dpt = STATES[0]["pupil_diameter_mm"], STATES[0]["focus_dpt"]
-    ahead = list(PsfStore(*streamed).planned_ahead(State(pupil_mm, focus_dpt)))
     store = PsfStore(*streamed)
+    first = state_nodes(store, State(pupil_mm, focus_dpt))
+    ahead = list(PsfStore(*streamed).planned_ahead(first))
     n_pupils, n_used = store.plan.group_shape[:2]
     assert len(ahead) == len({state for state, _ in ahead}) == n_pupils * n_used
     frame_layers(store, State(pupil_diameter_mm=pupil_mm, focus_dpt=focus_dpt))
@@ -173,14 +186,24 @@ def test_the_worker_plans_ahead_until_it_is_asked_for_something_else(monkeypatch
             for event in worker.poll():
                 assert not isinstance(event, BuildError), event
                 if isinstance(event, BuildDone):
-                    stores[event.ticket] = event.built.store
+                    store = stores[event.ticket] = event.built.store
+                    nodes = {state for state, _ in event.built.parts}
+                    assert nodes == set(state_nodes(store, job.near))
                 elif isinstance(event, BuildPart):
                     parts.append(event)
             if stores and len(tickets) == 1 and parts:
                 tickets.append(worker.submit(job))
             time.sleep(0.001)
+        near, of_near = State(6.9, 0.1), []
+        worker.plan_near(tickets[0], near)  # the earlier store
+        while not of_near:
+            assert time.monotonic() < deadline_s
+            of_near += [e for e in worker.poll() if isinstance(e, BuildPart)]
+            of_near = [part for part in of_near if part.ticket == tickets[0]]
+            time.sleep(0.001)
     finally:
         worker.close()
+    assert of_near[0].part[0] in state_nodes(stores[tickets[0]], near)
     n_states = np.prod(stores[tickets[0]].plan.group_shape[:2])
     of_first = [part for part in parts if part.ticket == tickets[0]]
     assert 0 < len(of_first) < n_states
@@ -362,10 +385,128 @@ def test_what_is_computed_ahead_is_what_the_frame_needs(streamed, views):
         seen = (SampledView.of(view),)
         use = SampledFrame(0.0, State(**state), lambda seen=seen: seen)
         ahead = handle.missing_psfs(use)
-        handle.fill(ahead, until_s=time.monotonic() + 60.0, batch_count=512)
+        store.fill(ahead)
         assert store.computed_count == ahead.size
         renderer.render(view, handle, **state)
         assert store.computed_count <= 1.15 * ahead.size
+
+
+def sampled(view, *, at_s=0.0, **state):
+    state = State(state["pupil_diameter_mm"], state["focus_dpt"])
+    seen = (SampledView.of(view),)
+    return SampledFrame(at_s, state, lambda: seen)
+
+
+@pytest.mark.parametrize("is_beside_a_frame", [False, True])
+def test_psfs_computed_beside_frames_are_the_same(
+    streamed, views, alone, is_beside_a_frame
+):
+    from filter_service.rendering.native import NativeRenderer
+
+    store, renderer, lock = PsfStore(*streamed), NativeRenderer(), PriorityLock()
+    handle, (view, state) = renderer.load(store), frames(views)[0]
+    missing = handle.missing_psfs(sampled(view, **state))
+    work = PsfWork(handle, missing)
+    with lock.foreground() if is_beside_a_frame else nullcontext():
+        work.compute(lock, lambda: False)
+    assert work.left.size == (0 if is_beside_a_frame else missing.size - BATCH)
+    assert store.computed_count == 0, "the store was changed without the lock"
+    store.fill(missing[::2])  # by a frame
+    while work.left.size or work.done:
+        work.add()
+        work.compute(lock, lambda: False)
+    assert store.computed_count == missing.size
+    whole = PsfStore(*streamed)
+    renderer.load(whole).missing_psfs(sampled(view, **state))
+    whole.fill(missing)
+    assert store.memory_mb == whole.memory_mb
+    for psf in missing[::7]:
+        assert kernel_of(store, psf) == kernel_of(whole, psf)
+    seen = renderer.render(view, handle, **state, output="srgb8")
+    assert seen.color.tobytes() == alone[0]
+
+
+def test_an_error_of_psfs_is_raised_when_they_are_added(streamed, views, monkeypatch):
+    from filter_service.rendering.native import NativeRenderer
+
+    handle = NativeRenderer().load(PsfStore(*streamed))
+    work = PsfWork(handle, handle.missing_psfs(sampled(views[0], **STATES[0])))
+
+    def fail(*_, **__):
+        raise BuildFailed("no light")
+
+    monkeypatch.setattr(PsfStore, "computed", fail)
+    work.compute(PriorityLock(), lambda: False)
+    with pytest.raises(BuildFailed, match="no light"):
+        work.add()
+
+
+def test_work_that_is_due_later_is_spread_over_frames(streamed, views, monkeypatch):
+    from filter_service.rendering.native import NativeRenderer
+
+    handle, lock = NativeRenderer().load(PsfStore(*streamed)), PriorityLock()
+    clock = SimpleNamespace(now_s=0.0)
+    clock.monotonic = lambda: clock.now_s
+    clock.sleep = lambda pause_s: setattr(clock, "now_s", clock.now_s + pause_s)
+    monkeypatch.setattr(psf_work, "time", clock)
+    missing = handle.missing_psfs(sampled(views[1], **STATES[0]))[:512]
+    work = PsfWork(handle, missing, due_s=0.15)
+    with lock.foreground():
+        work.compute(lock, lambda: False)
+    assert len(work.done) == missing.size / SPREAD_BATCH == 8
+    assert clock.now_s == pytest.approx(0.15)
+
+
+def test_a_predicted_state_between_other_nodes_finds_its_psfs_computed(streamed, views):
+    """A pupil that opens reads another node after the last frame, and only then."""
+    from filter_service.rendering.native import NativeRenderer
+
+    store, renderer = PsfStore(*streamed), NativeRenderer()
+    handle, focus_dpt = renderer.load(store), 0.3
+    nodes_mm = store.plan.pupils_mm
+    pupils_mm = nodes_mm[1] - np.array([0.06, 0.03, -0.03])
+    history, known_nodes = FrameHistory(), PredictedNodes()
+    for number, pupil_mm in enumerate(pupils_mm[:2].tolist()):
+        state = State(pupil_mm, focus_dpt)
+        history.record([views[0]], state, at_s=0.1 * number)
+        renderer.render(
+            views[0], handle, pupil_diameter_mm=pupil_mm, focus_dpt=focus_dpt
+        )
+    asked = []
+
+    def predict():
+        return predicted_work(handle, history, known_nodes, asked.append, is_busy=True)
+
+    assert predict() is None, "states are planned by the worker"
+    for part in PsfStore(*streamed).planned_ahead(state_nodes(store, asked[0])):
+        store.take(part)
+    before = store.computed_count
+    work = predict()
+    while work.left.size:
+        work.compute(PriorityLock(), lambda: False)
+    work.add()
+    n_ahead = store.computed_count - before
+    assert n_ahead > BATCH
+    renderer.render(
+        views[0], handle, pupil_diameter_mm=pupils_mm[2], focus_dpt=focus_dpt
+    )
+    assert store.computed_count - before <= 1.1 * n_ahead
+
+
+def test_a_new_eye_takes_over_the_arrays_of_a_released_one(streamed, views, alone):
+    from filter_service.rendering.native import NativeRenderer
+
+    renderer, (view, state) = NativeRenderer(), frames(views)[0]
+    first = renderer.load(PsfStore(*streamed))
+    renderer.render(view, first, **state)
+    arrays = renderer._eyes.of(first).arrays
+    second = renderer.load(PsfStore(*streamed))
+    assert renderer._eyes.of(second).arrays is not arrays
+    first.release()
+    third = renderer.load(PsfStore(*streamed))
+    seen = renderer.render(view, third, **state, output="srgb8")
+    assert seen.color.tobytes() == alone[0]
+    assert renderer._eyes.of(third).arrays is arrays
 
 
 def test_a_first_frame_is_guessed(known):

@@ -65,12 +65,22 @@ def test_a_call_that_pauses_lets_the_thread_work(working):
         assert working.n_pieces == before
 
 
-def test_a_call_waits_until_the_reserved_time_is_used(working):
+def test_calls_without_a_pause_leave_the_thread_a_step_each(working):
+    end_s = time.monotonic() + LIMIT_S
+    before, n_calls = working.n_pieces, 0
+    while working.n_pieces < before + 5 and time.monotonic() < end_s:
+        working.lock.let_thread_step(LIMIT_S)
+        with working.lock.foreground():
+            n_calls += 1
+    assert n_calls <= 5 * 20
+
+
+def test_a_call_within_another_does_not_wait_for_the_thread(working):
+    working.await_piece()
     with working.lock.foreground():
-        before = working.n_pieces
-        working.lock.reserve(0.005)
-    working.lock.wait_for_reserved(LIMIT_S)
-    assert working.n_pieces > before
+        started_s = time.monotonic()
+        working.lock.let_thread_step(LIMIT_S)
+        assert time.monotonic() < started_s + LIMIT_S / 2
 
 
 def test_a_signal_can_be_read_while_it_is_set():

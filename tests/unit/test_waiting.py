@@ -29,6 +29,7 @@ from filter_service.building.worker_handle import WorkerHandle
 from filter_service.errors import BuildFailed, ServiceTimeout
 from filter_service.filtering import eye_filter as eye_filter_module
 from filter_service.filtering.builder import Builder
+from filter_service.filtering.psf_work import BATCH
 from filter_service.messages import Accepted, Dropped, Progress, Ready, ResultView
 from filter_service.progress import Progress as ProgressBars
 from filter_service.waiting import Wait
@@ -142,22 +143,29 @@ def test_a_build_that_repeats_its_progress_ends_in_a_timeout(clock, call):
 
 
 class StoreDouble:
-    """A store that computes one PSF of five in a slice of time, and may lose it."""
+    """A store that computes one batch of five in a slice of time, and may lose it."""
 
     memory_mb = 0.0
     camera = CAMERA
+    is_released = False
 
     def __init__(self, clock, is_evicted):
         self.clock, self.is_evicted = clock, is_evicted
         self.computed_count = 0
 
     def missing_psfs(self, use, state=None):
-        return np.arange(self.computed_count, 5)
+        return np.arange(BATCH * self.computed_count, BATCH * 5)
 
-    def fill(self, psfs, *, until_s, batch_count):
+    def not_computed(self, psfs):
+        return psfs
+
+    def computed(self, psfs, *, thread_count):
         self.clock.now_s += STEP_S
+        return psfs
+
+    def add(self, found):
+        assert found.size == BATCH
         self.computed_count = 1 if self.is_evicted else self.computed_count + 1
-        return psfs[: 5 - self.computed_count]
 
     def release(self):
         pass

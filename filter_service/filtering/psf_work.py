@@ -1,0 +1,207 @@
+"""PSFs that the thread of the builder computes beside frames, and which these are.
+
+A frame that needs a new node of pupil or accommodation takes 1,000 to 5,000 new PSFs.
+They are computed before such a frame, if the stream predicts it.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Hashable
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from filter_service.camera import Camera
+from filter_service.filtering.frame_history import FrameHistory
+from filter_service.filtering.priority_lock import PriorityLock
+from filter_service.psfs.pack import ComputedPsfs
+from filter_service.psfs.store import StateNode
+from filter_service.rendering.frame_kernels import first_frame
+from filter_service.rendering.frame_states import FrameStore
+from filter_service.settings import FilterSettings
+from filter_service.view_state import State
+
+BATCH = 256
+"""PSFs per batch, 5 ms on two cores."""
+
+SPREAD_BATCH = 64
+"""PSFs per batch of work that is spread over frames."""
+
+MAX_PAUSE_S = 0.02
+"""Longest pause between such batches, during which nothing else is noticed."""
+
+FIRST_LEAD_S = 0.2
+"""Time after the last frame for which the PSFs of a first frame are predicted."""
+
+LEADS_S = (0.15, 0.4)
+"""Times after the last frame for which PSFs are predicted during a stream."""
+
+LATEST_RATIO = 0.7
+"""Share of such a time after which the PSFs should be computed."""
+
+
+@dataclass(eq=False)
+class PsfWork:
+    """Missing PSFs of a store.
+
+    `compute` needs no lock: it does not change the store, which frames may use.
+
+    Attributes
+    ----------
+    store : FrameStore
+    left : (n,)
+        PSFs that are not computed yet.
+    due_s : float, optional
+        Time of `time.monotonic` until which the work is spread evenly; by default, it
+        is done as soon as possible.
+    done : list of ComputedPsfs
+        Results that `add` adds to the store.
+    error : Exception, optional
+        Error of `compute`, which `add` raises.
+    """
+
+    store: FrameStore
+    left: NDArray[np.int64]
+    due_s: float | None = None
+    done: list[ComputedPsfs] = field(default_factory=list)
+    error: Exception | None = None
+
+    def __post_init__(self) -> None:
+        """Leave out PSFs that are computed, or share a kernel with another."""
+        self.left = self.store.not_computed(self.left)
+
+    def compute(self, lock: PriorityLock, is_over: Callable[[], bool]) -> None:
+        """Compute at least one batch, and more while frames hold the lock.
+
+        Beside a frame, this uses a single thread, and otherwise one for each core.
+
+        Parameters
+        ----------
+        lock : PriorityLock
+            Lock that `add` needs.
+        is_over : callable
+            Returns whether to stop.
+        """
+        while self.left.size and not (self.store.is_released or is_over()):
+            is_beside = lock.has_foreground
+            is_spread = is_beside and self.due_s is not None
+            count, started_s = SPREAD_BATCH if is_spread else BATCH, time.monotonic()
+            try:
+                found = self.store.computed(
+                    self.left[:count], thread_count=1 if is_beside else None
+                )
+            except Exception as error:  # reported by `add`, which holds the lock
+                self.error = error
+                return
+            self.done.append(found)
+            pause_s = self._pause_s(started_s) if is_spread else 0.0
+            self.left = self.left[count:]
+            if not lock.has_foreground:
+                return
+            time.sleep(pause_s)
+
+    def _pause_s(self, started_s: float) -> float:
+        """Return the pause after a batch that spreads the work evenly."""
+        if self.due_s is None:
+            return 0.0
+        now_s = time.monotonic()
+        batch_s = (self.due_s - started_s) * SPREAD_BATCH / self.left.size
+        return min(max(batch_s - (now_s - started_s), 0.0), MAX_PAUSE_S)
+
+    def add(self) -> None:
+        """Add the results to the store, or raise the error.
+
+        Raises
+        ------
+        GridTooLarge, BuildFailed, OutOfMemory
+            As `PsfStore.fill`.
+        """
+        if self.error is not None:
+            raise self.error
+        done, self.done = self.done, []
+        for found in done:
+            self.store.add(found)
+
+
+def first_psfs(
+    store: FrameStore, camera: Camera, settings: FilterSettings, history: FrameHistory
+) -> NDArray[np.int64]:
+    """Return missing PSFs (n,) of a first frame, in its likely state, too."""
+    if settings.prepare == "ranges":
+        return store.missing_psfs(None)
+    use = history.last or first_frame(camera, settings)
+    psfs = store.missing_psfs(use)
+    soon = history.predicted(FIRST_LEAD_S)
+    if (
+        soon is None
+        or soon == use.state
+        or not store.is_planned(store.state_nodes(soon))
+    ):
+        return psfs
+    return np.union1d(psfs, store.missing_psfs(use, state=soon))
+
+
+@dataclass(eq=False)
+class PredictedNodes:
+    """Nodes of pupil and accommodation that were predicted for a stream.
+
+    Attributes
+    ----------
+    last : tuple of StateNode
+        Nodes of the last frame.
+    found : set
+        Other nodes whose PSFs were looked for since then, each with its time, and
+        nodes that the worker plans.
+    """
+
+    last: tuple[StateNode, ...] = ()
+    found: set[Hashable] = field(default_factory=set)
+
+
+def predicted_work(
+    store: FrameStore,
+    history: FrameHistory,
+    known: PredictedNodes,
+    plan_near: Callable[[State], None],
+    *,
+    is_busy: bool,
+) -> PsfWork | None:
+    """Return missing PSFs of predicted states, the nearest state first.
+
+    Parameters
+    ----------
+    known : PredictedNodes
+        Nodes that were predicted before, which this updates.
+    plan_near : callable
+        Asks the worker to plan the nodes near a state.
+    is_busy : bool
+        Look only for states that read other nodes than the last frame.
+    """
+    last = history.last
+    if last is None:
+        return None
+    here = store.state_nodes(last.state)
+    if known.last != here:
+        known.last, known.found = here, set()
+    for lead_s in LEADS_S:
+        state = history.predicted(lead_s)
+        if state is None:
+            return None
+        nodes = store.state_nodes(state)
+        is_new = not set(nodes) <= set(here)
+        if (lead_s, nodes) in known.found or (is_busy and not is_new):
+            continue
+        if not store.is_planned(nodes):
+            if nodes not in known.found:
+                known.found.add(nodes)
+                plan_near(state)
+            continue
+        if is_new:
+            known.found.add((lead_s, nodes))
+        psfs = store.missing_psfs(last, state=state)
+        if psfs.size:
+            due_s = time.monotonic() + LATEST_RATIO * lead_s
+            return PsfWork(store, psfs, due_s)
+    return None
