@@ -561,24 +561,21 @@ class Builder:
 
     def _warm_ahead(self, stream: StreamEyes) -> PsfWork | None:
         """Add PSFs of predicted states that were computed; return those to compute."""
-        prepared, last = stream.store_in_use(), stream.history.last
-        if prepared is None or last is None:
+        prepared = stream.store_in_use()
+        if prepared is None:
             return None
         work = prepared.work
         try:
             if work is not None:
                 work.add()
-                if work.left.size:
-                    return work
-            prepared.work = None
-            if last is not stream.history.last_predicted:
-                stream.history.last_predicted = last
-                is_busy = self.frame_s > BUSY_SHARE * stream.history.interval_s
-                prepared.work = predicted_work(
-                    *(prepared.store, stream.history, prepared.predicted),
-                    partial(self.worker.plan_near, prepared.ticket),
-                    is_busy=is_busy,
-                )
+                work = work if work.left.size else None
+            is_busy = self.frame_s > BUSY_SHARE * stream.history.interval_s
+            prepared.work = predicted_work(
+                *(prepared.store, stream.history, prepared.predicted),
+                partial(self.worker.plan_near, prepared.ticket),
+                is_busy=is_busy,
+                work=work,
+            )
         except Exception as error:  # a frame that needs the PSFs reports it
             prepared.work = None
             log.info(

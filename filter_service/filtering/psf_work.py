@@ -29,14 +29,17 @@ BATCH = 256
 SPREAD_BATCH = 64
 """PSFs per batch of work that is spread over frames."""
 
-MAX_PAUSE_S = 0.02
-"""Longest pause between such batches, during which nothing else is noticed."""
+PAUSE_S = 0.002
+"""Interval of checks during the pauses between such batches."""
 
 FIRST_LEAD_S = 0.2
 """Time after the last frame for which the PSFs of a first frame are predicted."""
 
-LEADS_S = (0.15, 0.4)
-"""Times after the last frame for which PSFs are predicted during a stream."""
+LEADS_S = (0.06, 0.12, 0.25, 0.4)
+"""Times after the last frame for which states between other nodes are predicted."""
+
+IDLE_LEADS_S = (0.12, 0.4)
+"""The same for states between the same nodes, which need few new PSFs."""
 
 LATEST_RATIO = 0.7
 """Share of such a time after which the PSFs should be computed."""
@@ -60,11 +63,15 @@ class PsfWork:
         Results that `add` adds to the store.
     error : Exception, optional
         Error of `compute`, which `add` raises.
+    history : FrameHistory, optional
+        Frames of a stream.  A new one interrupts `compute`, because its predictions may
+        be more urgent.
     """
 
     store: FrameStore
     left: NDArray[np.int64]
     due_s: float | None = None
+    history: FrameHistory | None = None
     done: list[ComputedPsfs] = field(default_factory=list)
     error: Exception | None = None
 
@@ -84,7 +91,7 @@ class PsfWork:
         is_over : callable
             Returns whether to stop.
         """
-        while self.left.size and not (self.store.is_released or is_over()):
+        while self.left.size and not (self._is_interrupted or is_over()):
             is_beside = lock.has_foreground
             is_spread = is_beside and self.due_s is not None
             count, started_s = SPREAD_BATCH if is_spread else BATCH, time.monotonic()
@@ -96,19 +103,32 @@ class PsfWork:
                 self.error = error
                 return
             self.done.append(found)
-            pause_s = self._pause_s(started_s) if is_spread else 0.0
+            end_s = self._batch_end_s(started_s) if is_spread else started_s
             self.left = self.left[count:]
+            while lock.has_foreground and time.monotonic() < end_s:
+                if self._is_interrupted or is_over():
+                    return
+                time.sleep(PAUSE_S)
             if not lock.has_foreground:
                 return
-            time.sleep(pause_s)
 
-    def _pause_s(self, started_s: float) -> float:
-        """Return the pause after a batch that spreads the work evenly."""
-        if self.due_s is None:
-            return 0.0
-        now_s = time.monotonic()
-        batch_s = (self.due_s - started_s) * SPREAD_BATCH / self.left.size
-        return min(max(batch_s - (now_s - started_s), 0.0), MAX_PAUSE_S)
+    @property
+    def _is_interrupted(self) -> bool:
+        history = self.history
+        return self.store.is_released or (
+            history is not None and history.last is not history.last_predicted
+        )
+
+    def put_before(self, psfs: NDArray[np.int64], due_s: float) -> None:
+        """Compute more PSFs (n,) first."""
+        psfs = self.store.not_computed(psfs)
+        rest = self.left[np.isin(self.left, psfs, invert=True)]
+        self.left, self.due_s = np.concatenate([psfs, rest]), due_s
+
+    def _batch_end_s(self, started_s: float) -> float:
+        """Return the time at which the next batch starts, if all take equally long."""
+        assert self.due_s is not None
+        return started_s + (self.due_s - started_s) * SPREAD_BATCH / self.left.size
 
     def add(self) -> None:
         """Add the results to the store, or raise the error.
@@ -167,6 +187,7 @@ def predicted_work(
     plan_near: Callable[[State], None],
     *,
     is_busy: bool,
+    work: PsfWork | None = None,
 ) -> PsfWork | None:
     """Return missing PSFs of predicted states, the nearest state first.
 
@@ -178,30 +199,38 @@ def predicted_work(
         Asks the worker to plan the nodes near a state.
     is_busy : bool
         Look only for states that read other nodes than the last frame.
+    work : PsfWork, optional
+        PSFs that are already being computed, to which this adds others.
     """
     last = history.last
-    if last is None:
-        return None
+    if last is None or last is history.last_predicted:
+        return work
+    history.last_predicted = last
     here = store.state_nodes(last.state)
     if known.last != here:
         known.last, known.found = here, set()
     for lead_s in LEADS_S:
         state = history.predicted(lead_s)
         if state is None:
-            return None
+            return work
         nodes = store.state_nodes(state)
-        is_new = not set(nodes) <= set(here)
-        if (lead_s, nodes) in known.found or (is_busy and not is_new):
+        if set(nodes) <= set(here):
+            if is_busy or work is not None or lead_s not in IDLE_LEADS_S:
+                continue
+        elif (lead_s, nodes) in known.found:
             continue
-        if not store.is_planned(nodes):
+        elif not store.is_planned(nodes):
             if nodes not in known.found:
                 known.found.add(nodes)
                 plan_near(state)
             continue
-        if is_new:
+        else:
             known.found.add((lead_s, nodes))
         psfs = store.missing_psfs(last, state=state)
         if psfs.size:
             due_s = time.monotonic() + LATEST_RATIO * lead_s
-            return PsfWork(store, psfs, due_s)
-    return None
+            if work is None:
+                return PsfWork(store, psfs, due_s, history=history)
+            work.put_before(psfs, due_s)
+            return work
+    return work

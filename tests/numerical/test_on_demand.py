@@ -19,6 +19,7 @@ from filter_service.filtering.frame_history import FrameHistory
 from filter_service.filtering.priority_lock import PriorityLock
 from filter_service.filtering.psf_work import (
     BATCH,
+    PAUSE_S,
     SPREAD_BATCH,
     PredictedNodes,
     PsfWork,
@@ -454,7 +455,23 @@ def test_work_that_is_due_later_is_spread_over_frames(streamed, views, monkeypat
     with lock.foreground():
         work.compute(lock, lambda: False)
     assert len(work.done) == missing.size / SPREAD_BATCH == 8
-    assert clock.now_s == pytest.approx(0.15)
+    assert clock.now_s == pytest.approx(0.15, abs=8 * PAUSE_S)
+
+
+def test_a_new_frame_interrupts_work_for_predicted_ones(streamed, views):
+    from filter_service.rendering.native import NativeRenderer
+
+    handle, lock = NativeRenderer().load(PsfStore(*streamed)), PriorityLock()
+    missing = handle.missing_psfs(sampled(views[1], **STATES[0]))
+    history = FrameHistory()
+    work = PsfWork(handle, missing, time.monotonic(), history=history)
+    history.record(views[:1], State(4.0, 0.0), at_s=0.0)
+    with lock.foreground():
+        work.compute(lock, lambda: False)
+        assert not work.done
+        history.last_predicted = history.last
+        work.compute(lock, lambda: False)
+    assert not work.left.size
 
 
 def test_a_predicted_state_between_other_nodes_finds_its_psfs_computed(streamed, views):
@@ -480,6 +497,7 @@ def test_a_predicted_state_between_other_nodes_finds_its_psfs_computed(streamed,
     assert predict() is None, "states are planned by the worker"
     for part in PsfStore(*streamed).planned_ahead(state_nodes(store, asked[0])):
         store.take(part)
+    history.record([views[0]], state, at_s=0.11)
     before = store.computed_count
     work = predict()
     while work.left.size:
