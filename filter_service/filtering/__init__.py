@@ -10,6 +10,7 @@ planned_frame     a frame whose eyes are prepared, and `Filtered`
 stream_eyes       the profiles of a stream, their stores and events
 frame_history     the last frames of a stream, which predict the next ones
 builder           builder and engine shared by all streams
+store_load        loading of built stores
 psf_work          PSFs that are computed beside frames
 priority_lock     lock of frames and of the thread that prepares eyes
 shared_builder    builders shared within a process, and the choice of their engine

@@ -10,6 +10,7 @@ import logging
 import queue
 import threading
 import time
+from collections import deque
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, suppress
 from functools import partial
@@ -37,8 +38,10 @@ from filter_service.filtering.priority_lock import PriorityLock, Signal
 from filter_service.filtering.psf_work import (
     PsfWork,
     first_psfs,
+    likely_state,
     predicted_work,
 )
+from filter_service.filtering.store_load import StoreLoad
 from filter_service.filtering.stream_eyes import (
     AcceptedProfile,
     BuildingEye,
@@ -52,10 +55,8 @@ from filter_service.filtering.stream_eyes import (
 )
 from filter_service.heap import trim_heap
 from filter_service.rendering.engine import FrameEngine
-from filter_service.rendering.frame_kernels import first_frame
 from filter_service.rendering.frame_states import FrameStore
 from filter_service.settings import FilterSettings
-from filter_service.view_state import State
 
 MS_PER_S = 1e3
 
@@ -69,14 +70,15 @@ STEP_LIMIT_S, PAUSE_LIMIT_S = 0.04, 0.08
 """Longest times that a frame waits for the next step of the thread, and that it pauses
 for its steps."""
 
-BUILD_LEAD_S = 0.4
-"""Time after the last frame for which the nodes of a new eye are predicted."""
-
 CHECK_LIMIT, CHECK_GROWTH = 256, 4
 """Number of missing PSFs that the second check allows, and the factor by which each
 later one allows more.  A new eye is ready once a check finds no more than allowed, and
 its first frame computes them; a pupil that keeps moving needs new PSFs at every
 check."""
+
+FIRST_SHARE, PSF_S = 0.25, 3e-5
+"""The second check also allows PSFs that take this share of a frame, at so much time
+each, on two cores."""
 
 BUSY_SHARE = 0.4
 """If frames take more than this share of the frame interval, PSFs are predicted only
@@ -88,8 +90,7 @@ PROGRESS_INTERVAL_S = 0.1
 TRIM_AFTER_S = 0.5
 """Delay after which freed memory is returned to the system, which takes 1 to 10 ms."""
 
-IDLE_WAIT_S, RESTART_WAIT_S = 0.5, 0.1
-"""Longest waits for the worker's next message, and while it is not running."""
+IDLE_WAIT_S, RESTART_WAIT_S = 0.5, 0.1  # for the worker's message, or its start
 
 log = logging.getLogger("ocufilter")
 
@@ -141,6 +142,7 @@ class Builder:
         self._released: list[Any] = []
         self._dropping: list[Any] = []
         self._trim_at_s: float | None = None
+        self._loads: deque[StoreLoad] = deque()
         self._thread: threading.Thread | None = None
         self._is_closed = False
         self._wake = Signal()
@@ -163,8 +165,6 @@ class Builder:
             for eye in stream.eyes
             for prepared in eye.stores
         ]
-
-    # Frames
 
     @contextmanager
     def frame(self) -> Iterator[None]:
@@ -192,8 +192,6 @@ class Builder:
         """Release buffers of the engine after an idle period."""
         with self.exclusive():
             self.engine.trim()
-
-    # Events
 
     def _emit(self, stream: StreamEyes, event: EyeEvent) -> None:
         if isinstance(event, BuildingEye):
@@ -347,11 +345,11 @@ class Builder:
             with self._lock.background() as may_work:
                 if not may_work:
                     continue
+                work, has_more = None, False
                 try:
                     work, has_more = self._step()
                 except Exception:  # must not end the preparation of other eyes
                     log.exception("eyes could not be prepared")
-                    work, has_more = None, False
                 if not has_more or work is not None:
                     self._lock.resume()
             if work is not None:
@@ -360,9 +358,7 @@ class Builder:
                 continue
             self._trim_heap()
             worker = self.worker.file_descriptor
-            watched: list[Any] = (
-                [self._wake] if worker is None else [self._wake, worker]
-            )
+            watched: list[Any] = [self._wake, *([] if worker is None else [worker])]
             wait(watched, RESTART_WAIT_S if self.worker.needs_poll else IDLE_WAIT_S)
             self._wake.clear()
 
@@ -386,13 +382,12 @@ class Builder:
             self._trim_at_s = None
             trim_heap()
 
-    def _step(self) -> tuple[PsfWork | None, bool]:
-        """Process the worker's events, and add the PSFs that were computed.
+    def _step(self) -> tuple[PsfWork | StoreLoad | None, bool]:
+        """Process the worker's events, and add what was computed.
 
-        Returns the PSFs to compute next, and whether there is more to do after them.
+        Returns what to compute next, and whether there is more to do after that.
         """
-        events = self.worker.poll()
-        for event in events:
+        for event in self.worker.poll():
             self._count_advance(event)
             if isinstance(event, BuildPart):
                 self._add_part(event)
@@ -403,14 +398,16 @@ class Builder:
                 self._handle(stream, event)
         for stream in list(self.streams):
             self._submit(stream)
-        if self._thread and any(isinstance(event, BuildDone) for event in events):
-            return None, True  # a frame may go first: loading took 10 ms
         found = self._next_work()
         self._limit_memory()
         return found
 
-    def _next_work(self) -> tuple[PsfWork | None, bool]:
-        """Add the PSFs that were computed; return the next ones, as `_step`."""
+    def _next_work(self) -> tuple[PsfWork | StoreLoad | None, bool]:
+        """Add what was computed; return what to compute next, as `_step`."""
+        if self._loads and self._loads[0].is_done:
+            self._add_loaded(self._loads.popleft())
+        if self._loads:
+            return self._loads[0], True
         found, work = self._to_warm(), None
         if found is not None:
             self._warm_first(*found)
@@ -438,7 +435,9 @@ class Builder:
                 settings=following.eye.settings,
                 camera=following.camera,
                 limits=self._limits,
-                near=_likely_state(stream, following),
+                near=likely_state(
+                    following.camera, following.eye.settings, stream.history
+                ),
             )
         )
 
@@ -466,24 +465,33 @@ class Builder:
             fraction = EYE_PROGRESS * event.fraction
             self._emit(stream, BuildingEye(target.eye, fraction, event.stage))
         elif isinstance(event, BuildDone):
-            stream.ticket = stream.building = None
-            try:
-                loaded = self.engine.load(event.built.store)
-            except Exception as error:
-                self._fail(stream, target, _to_filter_error(error))
-                return
-            prepared = PreparedStore(
-                *(target.camera, loaded, target.eye.accepted_s, event.built.notes),
-                ticket=event.ticket,
+            self._loads.append(
+                StoreLoad(self.engine, stream, target, event.ticket, event.built)
             )
-            for part in event.built.parts:
-                loaded.add_part(part)
-            stream.add_store(target.eye, prepared)
         elif isinstance(event, BuildError):
             self._fail(stream, target, event.error)
 
+    def _add_loaded(self, load: StoreLoad) -> None:
+        """Add a loaded store to its stream, unless that has a newer profile."""
+        stream, prepared = load.stream, load.prepared
+        if stream.ticket != load.ticket:
+            if prepared is not None:
+                prepared.store.release()
+            return
+        stream.ticket = stream.building = None
+        if prepared is None:
+            assert load.error is not None
+            self._fail(stream, load.target, _to_filter_error(load.error))
+            return
+        for part in load.late_parts:
+            prepared.store.add_part(part)
+        stream.add_store(load.target.eye, prepared)
+
     def _add_part(self, event: BuildPart) -> None:
         """Add a part from the worker to its store, if that still exists."""
+        for load in self._loads:
+            if load.ticket == event.ticket:
+                load.late_parts.append(event.part)
         for prepared in self._prepared():
             if prepared.ticket == event.ticket:
                 prepared.store.add_part(event.part)
@@ -508,7 +516,7 @@ class Builder:
             psfs = first_psfs(store, prepared.camera, eye.settings, stream.history)
             prepared.work = PsfWork(store, psfs) if psfs.size else None
             n_checks, prepared.n_checks = prepared.n_checks, prepared.n_checks + 1
-            if psfs.size > _allowed_missing(n_checks):
+            if psfs.size > self._allowed_missing(n_checks):
                 return
             prepared.work = None
         except Exception as error:  # must not affect other streams
@@ -517,6 +525,13 @@ class Builder:
             self._fail(stream, target, _to_filter_error(error))
             return
         self._set_ready(stream, eye, prepared)
+
+    def _allowed_missing(self, n_checks: int) -> float:
+        """Return how many PSFs of a first frame may be missing after earlier checks."""
+        if not n_checks:
+            return 0.0
+        grown = float(CHECK_LIMIT * CHECK_GROWTH ** (n_checks - 1))
+        return max(grown, FIRST_SHARE * self.frame_s / PSF_S)
 
     def _report_progress(
         self,
@@ -569,11 +584,10 @@ class Builder:
             if work is not None:
                 work.add()
                 work = work if work.left.size else None
-            is_busy = self.frame_s > BUSY_SHARE * stream.history.interval_s
             prepared.work = predicted_work(
                 *(prepared.store, stream.history, prepared.predicted),
                 partial(self.worker.plan_near, prepared.ticket),
-                is_busy=is_busy,
+                is_busy=self.frame_s > BUSY_SHARE * stream.history.interval_s,
                 work=work,
             )
         except Exception as error:  # a frame that needs the PSFs reports it
@@ -602,17 +616,6 @@ class Builder:
         self._cancel(stream)
         self._emit(stream, EyeFailed(target.eye, error))
         stream.fail_build(target.eye, target.camera, error)
-
-
-def _allowed_missing(n_checks: int) -> int:
-    """Return how many PSFs of a first frame may be missing after earlier checks."""
-    return CHECK_LIMIT * CHECK_GROWTH ** (n_checks - 1) if n_checks else 0
-
-
-def _likely_state(stream: StreamEyes, target: BuildTarget) -> State:
-    """Return the likely pupil and focus of the first frame through a new eye."""
-    use = stream.history.last or first_frame(target.camera, target.eye.settings)
-    return stream.history.predicted(BUILD_LEAD_S) or use.state
 
 
 def _to_filter_error(error: Exception) -> FilterError:

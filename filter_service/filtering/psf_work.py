@@ -32,8 +32,12 @@ SPREAD_BATCH = 64
 PAUSE_S = 0.002
 """Interval of checks during the pauses between such batches."""
 
-FIRST_LEAD_S = 0.2
-"""Time after the last frame for which the PSFs of a first frame are predicted."""
+BUILD_LEAD_S = 0.4
+"""Time after the last frame for which the nodes of a new eye are predicted."""
+
+FIRST_LEAD_S, FIRST_LEAD_FRAMES = 0.2, 2.0
+"""Time after the last frame for which the PSFs of a first frame are predicted, and the
+least number of frame intervals."""
 
 LEADS_S = (0.06, 0.12, 0.25, 0.4)
 """Times after the last frame for which states between other nodes are predicted."""
@@ -145,6 +149,14 @@ class PsfWork:
             self.store.add(found)
 
 
+def likely_state(
+    camera: Camera, settings: FilterSettings, history: FrameHistory
+) -> State:
+    """Return the likely pupil and focus of the first frame through a new eye."""
+    use = history.last or first_frame(camera, settings)
+    return history.predicted(BUILD_LEAD_S) or use.state
+
+
 def first_psfs(
     store: FrameStore, camera: Camera, settings: FilterSettings, history: FrameHistory
 ) -> NDArray[np.int64]:
@@ -153,7 +165,8 @@ def first_psfs(
         return store.missing_psfs(None)
     use = history.last or first_frame(camera, settings)
     psfs = store.missing_psfs(use)
-    soon = history.predicted(FIRST_LEAD_S)
+    lead_s = max(FIRST_LEAD_S, FIRST_LEAD_FRAMES * history.interval_s)
+    soon = history.predicted(lead_s)
     if (
         soon is None
         or soon == use.state

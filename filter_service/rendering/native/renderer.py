@@ -51,6 +51,10 @@ MAX_EYES = 4
 """Cache size: the eyes of a stereo frame, and of other clients that stream at the same
 time."""
 
+MAX_TAKEN_MB = 150.0
+"""Memory of the arrays that a new eye takes over.  Emmetropia of 1280x720 has 75 MB, a
+cataract 250."""
+
 
 @dataclass(eq=False)
 class EyeState:
@@ -80,15 +84,19 @@ class EyeStates:
     def of(self, handle: NativeStore) -> EyeState:
         """Return the state of an eye, which becomes the most recently used.
 
-        A new eye takes over the arrays of a released one.  In the first frame of a
-        cataract of 1280x720, touching new memory took 0.2 s.
+        A new eye takes over the arrays of a released one, unless they are large.  In
+        the first frame of a cataract of 1280x720, touching new memory took 0.2 s.
         """
         found = next((eye for eye in self._eyes if eye.handle is handle), None)
         others = [
             eye for eye in self._eyes if eye is not found and not eye.handle.is_released
         ]
         if found is None:
-            released = [eye.arrays for eye in self._eyes if eye.handle.is_released]
+            released = [
+                eye.arrays
+                for eye in self._eyes
+                if eye.handle.is_released and eye.arrays.memory_mb <= MAX_TAKEN_MB
+            ]
             found = EyeState(handle, arrays=released[-1] if released else Arrays())
         self._eyes = [*others[1 - MAX_EYES :], found]
         return found
