@@ -72,13 +72,12 @@ for its steps."""
 
 CHECK_LIMIT, CHECK_GROWTH = 256, 4
 """Number of missing PSFs that the second check allows, and the factor by which each
-later one allows more.  A new eye is ready once a check finds no more than allowed, and
-its first frame computes them; a pupil that keeps moving needs new PSFs at every
-check."""
+later one allows more.  A pupil that keeps moving needs new PSFs at every check."""
 
-FIRST_SHARE, PSF_S = 0.25, 3e-5
-"""The second check also allows PSFs that take this share of a frame, at so much time
-each, on two cores."""
+FIRST_SHARE, PSF_S = 0.35, 1.5e-5
+"""The first frame through a new eye may compute PSFs in this share of its duration, at
+so much time each.  On two cores, it computes them in a third of the time that the
+thread takes beside frames."""
 
 BUSY_SHARE = 0.4
 """If frames take more than this share of the frame interval, PSFs are predicted only
@@ -234,8 +233,6 @@ class Builder:
                 timeout_s = 0.0
         self.deliver(stream, timeout_s)
 
-    # Streams
-
     def prepare(self) -> None:
         """Let the thread look for new work; start it if there is none."""
         if self._thread is None and self.worker.has_process:
@@ -336,8 +333,6 @@ class Builder:
             if self._thread is not None:
                 self._released += retired
         self._wake.set()
-
-    # The thread
 
     def _run(self) -> None:
         """Prepare eyes until the builder is closed."""
@@ -466,7 +461,10 @@ class Builder:
             self._emit(stream, BuildingEye(target.eye, fraction, event.stage))
         elif isinstance(event, BuildDone):
             self._loads.append(
-                StoreLoad(self.engine, stream, target, event.ticket, event.built)
+                StoreLoad(
+                    *(self.engine, stream, target, event.ticket, event.built),
+                    enough=self._frame_psfs,
+                )
             )
         elif isinstance(event, BuildError):
             self._fail(stream, target, event.error)
@@ -496,8 +494,6 @@ class Builder:
             if prepared.ticket == event.ticket:
                 prepared.store.add_part(event.part)
 
-    # PSFs that are computed before frames need them
-
     def _warm_first(
         self,
         stream: StreamEyes,
@@ -510,15 +506,22 @@ class Builder:
             if prepared.work is not None:
                 prepared.work.add()
                 self._report_progress(stream, eye, prepared, prepared.work)
-                if prepared.work.left.size:
+                if not prepared.work.is_enough:
                     return
             # Pupil and focus may have changed meanwhile, so check again.
-            psfs = first_psfs(store, prepared.camera, eye.settings, stream.history)
-            prepared.work = PsfWork(store, psfs) if psfs.size else None
-            n_checks, prepared.n_checks = prepared.n_checks, prepared.n_checks + 1
-            if psfs.size > self._allowed_missing(n_checks):
-                return
+            psfs = first_psfs(
+                *(store, prepared.camera, eye.settings, stream.history),
+                is_first_check=not prepared.n_checks,
+            )
+            allowed, enough = 0, self._frame_psfs
+            if prepared.n_checks:
+                grown = CHECK_LIMIT * CHECK_GROWTH ** (prepared.n_checks - 1)
+                allowed = max(grown, enough)
+            prepared.n_checks += 1
             prepared.work = None
+            if psfs.size > allowed:
+                prepared.work = PsfWork(store, psfs, enough=enough)
+                return
         except Exception as error:  # must not affect other streams
             prepared.work = None
             target = BuildTarget(eye, prepared.camera)
@@ -526,12 +529,10 @@ class Builder:
             return
         self._set_ready(stream, eye, prepared)
 
-    def _allowed_missing(self, n_checks: int) -> float:
-        """Return how many PSFs of a first frame may be missing after earlier checks."""
-        if not n_checks:
-            return 0.0
-        grown = float(CHECK_LIMIT * CHECK_GROWTH ** (n_checks - 1))
-        return max(grown, FIRST_SHARE * self.frame_s / PSF_S)
+    @property
+    def _frame_psfs(self) -> int:
+        """Return how many PSFs the first frame through a new eye may compute."""
+        return int(FIRST_SHARE * self.frame_s / PSF_S)
 
     def _report_progress(
         self,

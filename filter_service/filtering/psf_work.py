@@ -63,6 +63,8 @@ class PsfWork:
     due_s : float, optional
         Time of `time.monotonic` until which the work is spread evenly; by default, it
         is done as soon as possible.
+    enough : int
+        Number of PSFs that may be left, for the frame that needs them.
     done : list of ComputedPsfs
         Results that `add` adds to the store.
     error : Exception, optional
@@ -75,6 +77,7 @@ class PsfWork:
     store: FrameStore
     left: NDArray[np.int64]
     due_s: float | None = None
+    enough: int = 0
     history: FrameHistory | None = None
     done: list[ComputedPsfs] = field(default_factory=list)
     error: Exception | None = None
@@ -113,8 +116,13 @@ class PsfWork:
                 if self._is_interrupted or is_over():
                     return
                 time.sleep(PAUSE_S)
-            if not lock.has_foreground:
+            if self.is_enough or not lock.has_foreground:
                 return
+
+    @property
+    def is_enough(self) -> bool:
+        """Return whether a frame may compute the PSFs that are left."""
+        return self.left.size <= self.enough
 
     @property
     def _is_interrupted(self) -> bool:
@@ -158,22 +166,29 @@ def likely_state(
 
 
 def first_psfs(
-    store: FrameStore, camera: Camera, settings: FilterSettings, history: FrameHistory
+    store: FrameStore,
+    camera: Camera,
+    settings: FilterSettings,
+    history: FrameHistory,
+    *,
+    is_first_check: bool,
 ) -> NDArray[np.int64]:
-    """Return missing PSFs (n,) of a first frame, in its likely state, too."""
+    """Return missing PSFs (n,) of a first frame, in its likely state.
+
+    Parameters
+    ----------
+    is_first_check : bool
+        Whether many PSFs may be missing, so that their frame is not the next one.
+    """
     if settings.prepare == "ranges":
         return store.missing_psfs(None)
     use = history.last or first_frame(camera, settings)
-    psfs = store.missing_psfs(use)
-    lead_s = max(FIRST_LEAD_S, FIRST_LEAD_FRAMES * history.interval_s)
-    soon = history.predicted(lead_s)
-    if (
-        soon is None
-        or soon == use.state
-        or not store.is_planned(store.state_nodes(soon))
-    ):
-        return psfs
-    return np.union1d(psfs, store.missing_psfs(use, state=soon))
+    lead_s = FIRST_LEAD_FRAMES * history.interval_s
+    lead_s = max(FIRST_LEAD_S, lead_s) if is_first_check else history.interval_s
+    soon = history.predicted(lead_s) or use.state
+    if soon != use.state and not store.is_planned(store.state_nodes(soon)):
+        soon = use.state
+    return store.missing_psfs(use, state=soon)
 
 
 @dataclass(eq=False)

@@ -30,6 +30,8 @@ class StoreLoad:
     target : BuildTarget
     ticket : int
     built : BuiltStore
+    enough : int
+        Number of PSFs of a first frame that may be missing.
     late_parts : list
         Parts of the store that arrive meanwhile.
     prepared : PreparedStore, optional
@@ -43,6 +45,7 @@ class StoreLoad:
     target: BuildTarget
     ticket: int
     built: BuiltStore
+    enough: int
     late_parts: list[Any] = field(default_factory=list)
     prepared: PreparedStore | None = None
     error: Exception | None = None
@@ -59,8 +62,11 @@ class StoreLoad:
             store = self.engine.load(self.built.store)
             for part in self.built.parts:
                 store.add_part(part)
-            psfs = first_psfs(store, camera, eye.settings, self.stream.history)
-            work = PsfWork(store, psfs) if psfs.size else None
+            psfs = first_psfs(
+                *(store, camera, eye.settings, self.stream.history),
+                is_first_check=True,
+            )
+            work = PsfWork(store, psfs, enough=self.enough) if psfs.size else None
         except Exception as error:  # reported by the builder
             self.error = error
             return

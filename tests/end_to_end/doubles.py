@@ -40,6 +40,12 @@ class StoreDouble:
     def missing_psfs(self, use=None, *, state=None):
         return np.zeros(0, np.int64)
 
+    def state_nodes(self, state):
+        return ()
+
+    def is_planned(self, nodes):
+        return True
+
     def evict(self, max_mb):
         """Nothing goes."""
 

@@ -427,6 +427,18 @@ def test_psfs_computed_beside_frames_are_the_same(
     assert seen.color.tobytes() == alone[0]
 
 
+def test_a_frame_may_compute_the_last_psfs(streamed, views):
+    from filter_service.rendering.native import NativeRenderer
+
+    handle, lock = NativeRenderer().load(PsfStore(*streamed)), PriorityLock()
+    missing = handle.missing_psfs(sampled(views[1], **STATES[0]))
+    work = PsfWork(handle, missing, enough=missing.size - BATCH - 1)
+    with lock.foreground():
+        work.compute(lock, lambda: False)
+    assert work.left.size == missing.size - 2 * BATCH
+    assert work.is_enough
+
+
 def test_an_error_of_psfs_is_raised_when_they_are_added(streamed, views, monkeypatch):
     from filter_service.rendering.native import NativeRenderer
 
