@@ -131,6 +131,7 @@ class Frame(c.Structure):
         ("blend_scratch_floats", c.c_uint64),
         ("recipe_texel_count", c.c_uint64),
         ("kernel_texel_count", c.c_uint64),
+        ("kernel_gap_count", c.c_uint64),
         ("picture", POINTER),
         ("output_kind", c.c_int32),
         ("failed", c.c_int32),

@@ -44,7 +44,7 @@ INLINE i32x8 read_pairs(const uint32_t *from) {
 
 /* A fragment as it is added to a raster. */
 typedef struct {
-    f32x4 color;              /* the fourth lane is the strength of an edge, or no matter */
+    f32x4 color;              /* per step of weight; the fourth lane is the strength of an edge */
     int32_t factors;          /* shares of both ends of its kernel */
     int32_t from;             /* texel of its kernel at the first pixel of the raster, from the
                                * first one of the kernel */
@@ -55,9 +55,9 @@ typedef struct {
 /* Fragments of a cluster that are added to a raster. */
 typedef struct {
     int count;
-    int is_plain;             /* scales are 1; no strength and no excess */
+    int is_plain;             /* full coverage, no strength and no excess: without `scales` */
     member of[BLOCK_PIXELS];
-    f32x4 scales[BLOCK_PIXELS]; /* of coverage; the fourth lane is the excess light */
+    f32x4 scales[BLOCK_PIXELS]; /* coverage per step; the fourth lane is the excess light */
 } members;
 
 #define ALL_GROUPS INT32_MIN
@@ -75,7 +75,10 @@ INLINE member member_of(const frame *f, uint32_t at, const level_image *image,
     const fragment *one = f->fragments + at;
     int r = image->resolution;
     int left = (one->x >> r) - image->left - own->x0, top = (one->y >> r) - image->up - own->y0;
-    return (member){load4((const float *)(f->lights + at)), (int32_t)one->fraction,
+    /* light of up to 1e38 must not be multiplied by whole steps of weight */
+    f32x4 color = load4((const float *)(f->lights + at))
+                  * (f32x4){image->scale, image->scale, image->scale, 0.0f};
+    return (member){color, (int32_t)one->fraction,
                     -left - top * row_texels(image), top, left};
 }
 
@@ -104,13 +107,14 @@ INLINE void list_members(const frame *f, const cluster *from, int32_t group,
         if (share <= 0.0f) continue;
         if (f->blend_shares != NULL) share *= f->blend_shares[at];
         member one = member_of(f, at, image, own);
-        f32x4 scales = {share, share, share, 0.0f};
-        one.color *= scales;
+        one.color *= all4(share);
+        float weight = share * image->scale;
+        f32x4 scales = {weight, weight, weight, 0.0f};
         if (f->fragments[at].state & SPECIAL_BIT) {
             const fragment_extra *extra = f->extras + at;
-            float coverage = share * extra->coverage;
-            one.color += (f32x4){0.0f, 0.0f, 0.0f, share * extra->strength};
-            scales = (f32x4){coverage, coverage, coverage, share * extra->excess};
+            float coverage = weight * extra->coverage;
+            one.color += (f32x4){0.0f, 0.0f, 0.0f, weight * extra->strength};
+            scales = (f32x4){coverage, coverage, coverage, weight * extra->excess};
         }
         all->scales[all->count] = scales;
         all->of[all->count++] = one;
@@ -148,8 +152,7 @@ INLINE void add_columns(const frame *f, const members *all, int count, const lev
     const uint32_t *texels =
         f->kernel_texels + 4 * (size_t)image->first_texel + row * stride + 8 * pair;
     pixel_pair *to = own->pairs + row * own->stride + pair;
-    float scale = image->scale;
-    f32x8 scales = twice4((f32x4){scale, scale, scale, is_plain ? 0.0f : scale});
+    f32x8 scales = twice4((f32x4){image->scale, image->scale, image->scale, 0.0f});
     for (; row < last_row; ++row, texels += stride, to += own->stride) {
         while (end < last && end->top <= row) ++end;
         while (one < end && one->top + image->height <= row) ++one;
@@ -173,8 +176,8 @@ INLINE void add_columns(const frame *f, const members *all, int count, const lev
             }
         }
         for (int p = 0; p < pairs; ++p) {
-            to[p].light += light[p] * scales;
-            to[p].coverage += coverage[p] * scales;
+            to[p].light += light[p];
+            to[p].coverage += is_plain ? coverage[p] * scales : coverage[p];
         }
     }
 }

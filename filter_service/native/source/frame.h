@@ -191,6 +191,7 @@ typedef struct {
     float *blend_scratch;
     uint64_t blend_scratch_floats;                 /* of one thread */
     uint64_t recipe_texel_count, kernel_texel_count;
+    uint64_t kernel_gap_count;                     /* of these, zeros between rows */
 
     /* The output image. */
     void *picture;            /* (image_height, image_width, 3) */

@@ -13,7 +13,7 @@ INLINE int row_texels(const level_image *image) { return image->width + ROW_GAP_
 
 /* Lays out the levels of all kernels that fragments use, consecutively. */
 static void place_kernels(frame *f) {
-    uint64_t texel = ROW_GAP_TEXELS;
+    uint64_t texel = ROW_GAP_TEXELS, gaps = ROW_GAP_TEXELS;
     uint64_t largest = 0;
     for (int k = 0; k < f->kernel_count; ++k) {
         const kernel_shape *shape = f->shapes + k;
@@ -39,11 +39,13 @@ static void place_kernels(frame *f) {
             image->first_texel = (uint32_t)texel;
             uint64_t texels = (uint64_t)row_texels(image) * (uint64_t)image->height;
             texel += texels;
+            gaps += ROW_GAP_TEXELS * (uint64_t)image->height;
             texels += LEVEL_PAD * (uint64_t)image->height;
             largest = texels > largest ? texels : largest;
         }
     }
     f->kernel_texel_count = texel;
+    f->kernel_gap_count = gaps;
     /* both ends of a kernel at all levels, four floats per texel */
     uint64_t floats = 2 * (MAX_LEVEL + 1) * 4 * (largest + 64);
     if (floats > f->blend_scratch_floats) f->blend_scratch_floats = floats;

@@ -262,7 +262,7 @@ class NativeRenderer(OneView):
             merged_count=frame.c.merged_count,
             entry_count=frame.c.entry_count,
             kernel_count=plan.kernels.count,
-            kernel_texel_count=sizes.kernel_texels,
+            kernel_texel_count=sizes.kernel_texels - frame.c.kernel_gap_count,
             layer_count=len(layers.layer_dpt),
             notes=input_notes(view.depth_m, missing_count, frame.c.bad_color_count),
         )
