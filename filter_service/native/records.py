@@ -4,6 +4,8 @@ import ctypes as c
 
 import numpy as np
 
+from estimator.native.records import pointer_to
+
 POINTER = c.c_void_p
 
 RESOLUTIONS = 3
@@ -198,6 +200,33 @@ class MapTables(c.Structure):
     )
 
 
+class ListJob(c.Structure):
+    """Job that lists kernels; `source/kernel_job.h` documents the fields."""
+
+    _fields_ = (
+        ("used", POINTER),
+        ("cell_nodes", POINTER),
+        ("n_cells", c.c_int64),
+        ("n_intervals", c.c_int64),
+        ("n_fields", c.c_int64),
+        ("n_layers", c.c_int64),
+        ("cells", POINTER),
+        ("intervals", POINTER),
+        ("parts", POINTER),
+        ("kernel_of", POINTER),
+        ("fields", POINTER),
+        ("node_intervals", POINTER),
+        ("near", POINTER),
+        ("far", POINTER),
+        ("recipe_fields", POINTER),
+        ("recipe_layers", POINTER),
+        ("marks", POINTER),
+        ("count", c.c_int64),
+        ("node_count", c.c_int64),
+        ("recipe_count", c.c_int64),
+    )
+
+
 class RecipeJob(c.Structure):
     """Job that plans node kernels; `source/kernel_job.h` documents the fields."""
 
@@ -205,14 +234,22 @@ class RecipeJob(c.Structure):
         ("tables", StoreTables),
         ("reads", StateReads),
         ("fields", POINTER),
-        ("total_dpt", POINTER),
+        ("layers", POINTER),
+        ("layer_dpt", POINTER),
+        ("layer_zero_dpt", POINTER),
         ("words", POINTER),
         ("reach_px", POINTER),
         ("radius_px", POINTER),
         ("peak_ratio", POINTER),
         ("spread_px", POINTER),
+        ("near", POINTER),
+        ("far", POINTER),
+        ("node_reach_px", POINTER),
+        ("node_radius_px", POINTER),
+        ("node_peak_ratio", POINTER),
         ("missing", POINTER),
         ("count", c.c_int64),
+        ("node_count", c.c_int64),
         ("frame_number", c.c_uint32),
     )
 
@@ -295,8 +332,9 @@ class SizeJob(c.Structure):
         ("node_reach_px", POINTER),
         ("node_radius_px", POINTER),
         ("node_peak_ratio", POINTER),
-        ("near_spread_px", POINTER),
-        ("far_spread_px", POINTER),
+        ("near", POINTER),
+        ("far", POINTER),
+        ("recipe_spread_px", POINTER),
         ("weight_ratio", POINTER),
         ("maps", POINTER),
         ("reach_px", POINTER),
@@ -317,7 +355,7 @@ def pointers(**arrays: np.ndarray) -> dict[str, int]:
     for name, array in arrays.items():
         if not array.flags.c_contiguous:
             raise TypeError(f"{name}: strides {array.strides}; expected contiguous")
-    return {name: int(array.ctypes.data) for name, array in arrays.items()}
+    return {name: pointer_to(array) for name, array in arrays.items()}
 
 
 class NodeJob(c.Structure):
@@ -363,5 +401,6 @@ SIZES = (
     c.sizeof(OmittedJob),
     c.sizeof(LightJob),
     c.sizeof(NodeJob),
+    c.sizeof(ListJob),
 )
 """Expected result of `ocu_sizes`."""

@@ -388,6 +388,18 @@ def input_notes(
     )
 
 
+def _is_near(sampled_m: NDArray[np.float32]) -> bool:
+    """Return whether the depth in the middle is plausible, as in most frames."""
+    rows, columns = sampled_m.shape
+    middle_m = sampled_m[rows // 2, columns // 2]
+    return bool(0.0 < middle_m < FAR_SCENE_M)
+
+
+def _is_beyond(sampled_m: NDArray[np.float32], far_m: float) -> bool:
+    known_m = sampled_m[(sampled_m > 0.0) & (sampled_m < np.inf)]
+    return bool(known_m.size and known_m.min() >= far_m)
+
+
 def sampled_input_notes(
     sampled_m: NDArray[np.float32], bad_color_count: int, *, has_depth: bool
 ) -> tuple[str, ...]:
@@ -395,8 +407,7 @@ def sampled_input_notes(
     notes: list[str] = []
     if not has_depth:
         notes.append(Note("no_depth", "no pixel has depth; infinity is assumed"))
-    known_m = sampled_m[(sampled_m > 0.0) & (sampled_m < np.inf)]
-    if known_m.size and known_m.min() >= FAR_SCENE_M:
+    if not _is_near(sampled_m) and _is_beyond(sampled_m, FAR_SCENE_M):
         text = f"all depth is beyond {FAR_SCENE_M:g} m: is it in meters?"
         notes.append(Note("depth_implausible", text, beyond_m=FAR_SCENE_M))
     if bad_color_count:

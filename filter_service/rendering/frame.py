@@ -64,10 +64,10 @@ def fill_missing_depth(
     Nearest means by Euclidean distance in the image; if no pixel is valid, all are at
     infinity.
     """
+    if depth_m.size and depth_m.min() >= MIN_DEPTH_M:  # not if any depth is NaN
+        return depth_m, 0
     missing = ~(depth_m >= MIN_DEPTH_M)
     count = int(np.count_nonzero(missing))
-    if count == 0:
-        return depth_m, 0
     if count == depth_m.size:
         return np.full_like(depth_m, np.inf), count
     from scipy.ndimage import distance_transform_edt

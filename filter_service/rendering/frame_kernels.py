@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -94,6 +94,8 @@ class FrameKernels:
         Upper bound on the weights.
     spread_px : (n, 2)
         Spread at the two ends of the interval.
+    kernel_of : (n_cells, n_intervals), uint32
+        Kernel of each pair; 0 if unused.
     """
 
     nodes: NodeKernels
@@ -106,6 +108,7 @@ class FrameKernels:
     radius_px: NDArray[np.int64]
     peak_ratio: NDArray[np.float64]
     spread_px: NDArray[np.float64]
+    kernel_of: NDArray[np.uint32]
 
     @property
     def count(self) -> int:
@@ -138,22 +141,24 @@ def frame_kernels(
     fill : callable, optional
         Function that computes missing PSFs; `PsfStore.fill` by default.
     """
-    n_fields, maps = len(layers.layer_zero_dpt), image.maps.tables
-    cells, intervals, parts, *pairs = _list_nodes(used, image, n_fields)
+    maps = image.maps.tables
+    listed = _list_kernels(used, layers, image)
     nodes = _node_kernels(
-        store, tables or store.tables, fill or store.fill, layers, *pairs
+        store, tables or store.tables, fill or store.fill, layers, listed
     )
     if isinstance(nodes, MissingPsfs):
         return nodes
+    cells = listed.cells
     inputs = {
-        "cell_weight_ratio": np.ascontiguousarray(image.weight_ratio),
+        "cell_weight_ratio": image.weights,
         "cells": cells,
-        "parts": parts,
+        "parts": listed.parts,
         "node_reach_px": nodes.reach_px,
         "node_radius_px": nodes.radius_px,
         "node_peak_ratio": nodes.peak_ratio,
-        "near_spread_px": nodes.recipe_spread_px[nodes.near],
-        "far_spread_px": nodes.recipe_spread_px[nodes.far],
+        "near": nodes.near,
+        "far": nodes.far,
+        "recipe_spread_px": nodes.recipe_spread_px,
     }
     found: dict[str, NDArray[Any]] = {
         "weight_ratio": np.empty((cells.size, 2, FIELD_CORNERS)),
@@ -170,7 +175,12 @@ def frame_kernels(
     )
     loops().call("fill_sizes", job)
     return FrameKernels(
-        nodes=nodes, cells=cells, intervals=intervals, parts=parts, **found
+        nodes=nodes,
+        cells=cells,
+        intervals=listed.intervals,
+        parts=listed.parts,
+        kernel_of=listed.kernel_of,
+        **found,
     )
 
 
@@ -181,51 +191,83 @@ def missing_psfs(
     used: NDArray[np.bool_],
 ) -> NDArray[np.int64]:
     """Return the indices (n,) of needed PSFs that have not been computed yet."""
-    *_, fields, intervals = _list_nodes(used, image, len(layers.layer_zero_dpt))
-    found = _node_kernels(
-        store, store.tables, lambda psfs: psfs, layers, fields, intervals
-    )
+    listed = _list_kernels(used, layers, image)
+    found = _node_kernels(store, store.tables, lambda psfs: psfs, layers, listed)
     return found.psfs if isinstance(found, MissingPsfs) else np.zeros(0, np.int64)
 
 
-def _list_nodes(
-    used: NDArray[np.bool_], image: ImageCells, n_fields: int
-) -> tuple[NDArray[np.int64], ...]:
-    """List the kernels of used pairs, and the node kernels that they consist of.
+class KernelList(NamedTuple):
+    """Kernels of used pairs, the node kernels that they consist of, and their recipes.
 
-    A node with zero weight is replaced by the node with the largest weight.
+    All are in order of cell or field, then interval or layer.
 
-    Returns
-    -------
+    Attributes
+    ----------
     cells, intervals : (n,)
         Pairs of the kernels.
     parts : (n, 3)
         Their node kernels.
-    fields, node_intervals : (m,)
-        Field node and interval of each node kernel.
+    kernel_of : (n_cells, n_intervals), uint32
+        Kernel of each pair; 0 if unused.
+    near, far : (m,)
+        Recipes of each node kernel.
+    recipe_fields, recipe_layers : (n_recipes,)
+        Field node and layer of each recipe.
     """
-    nodes, weight_ratio = image.nodes, image.weight_ratio
-    heaviest = np.take_along_axis(nodes, weight_ratio.argmax(axis=1)[:, None], axis=1)
-    nodes = np.where(weight_ratio > 0.0, nodes, heaviest)
-    n_intervals = used.shape[1]
-    cells, intervals = np.divmod(np.flatnonzero(used), n_intervals)
-    pairs = nodes[cells] * n_intervals + intervals[:, None]
-    found, parts = _numbered(pairs, n_fields * n_intervals)
-    return cells, intervals, parts, *np.divmod(found, n_intervals)
+
+    cells: NDArray[np.int64]
+    intervals: NDArray[np.int64]
+    parts: NDArray[np.int64]
+    kernel_of: NDArray[np.uint32]
+    near: NDArray[np.int64]
+    far: NDArray[np.int64]
+    recipe_fields: NDArray[np.int64]
+    recipe_layers: NDArray[np.int64]
 
 
-def _numbered(
-    values: NDArray[np.int64], count: int
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the distinct values (m,), ascending, and each value's number among them.
-
-    `numpy.unique` sorts; this takes a table of ``count`` possible values.
-    """
-    number = np.zeros(count, np.int64)
-    number[values] = 1
-    found = np.flatnonzero(number)
-    number[found] = np.arange(found.size)
-    return found, number[values]
+def _list_kernels(
+    used: NDArray[np.bool_], layers: FrameLayers, image: ImageCells
+) -> KernelList:
+    """List the kernels of used pairs (n_cells, n_intervals)."""
+    n_fields, n_layers = len(layers.layer_zero_dpt), len(layers.layer_dpt)
+    n_cells, n_intervals = used.shape
+    used = np.ascontiguousarray(used)
+    count = int(np.count_nonzero(used))
+    most = n_fields * max(n_intervals, n_layers)
+    cells, intervals = np.empty((2, count), np.int64)
+    parts = np.empty((count, FIELD_CORNERS), np.int64)
+    kernel_of = np.zeros(used.shape, np.uint32)
+    rows = np.empty((6, most), np.int64)
+    names = ("fields", "node_intervals", "near", "far")
+    recipe_names = ("recipe_fields", "recipe_layers")
+    found = dict(zip((*names, *recipe_names), rows, strict=True))
+    marks = np.zeros(most, np.int64)
+    job = records.ListJob(
+        n_cells=n_cells,
+        n_intervals=n_intervals,
+        n_fields=n_fields,
+        n_layers=n_layers,
+        **pointers(
+            used=used,
+            cell_nodes=image.read_nodes,
+            cells=cells,
+            intervals=intervals,
+            parts=parts,
+            kernel_of=kernel_of,
+            marks=marks,
+            **found,
+        ),
+    )
+    loops().call("list_kernels", job)
+    return KernelList(
+        cells=cells,
+        intervals=intervals,
+        parts=parts,
+        kernel_of=kernel_of,
+        near=found["near"][: job.node_count],
+        far=found["far"][: job.node_count],
+        **{name: found[name][: job.recipe_count] for name in recipe_names},
+    )
 
 
 def _node_kernels(
@@ -233,36 +275,38 @@ def _node_kernels(
     tables: StoreTables,
     fill: Fill,
     layers: FrameLayers,
-    fields: NDArray[Any],
-    intervals: NDArray[Any],
+    listed: KernelList,
 ) -> NodeKernels | MissingPsfs:
     """Plan node kernels (n,), with a recipe for each field node and layer in use."""
-    n_layers = len(layers.layer_dpt)
-    ends = np.minimum(np.stack([intervals, intervals + 1]), n_layers - 1)
-    ends += fields * n_layers
-    found, (near, far) = _numbered(ends, len(layers.layer_zero_dpt) * n_layers)
-    recipe_fields, recipe_layers = np.divmod(found, n_layers)
-    count = found.size
+    count, n_nodes = listed.recipe_fields.size, listed.near.size
     recipes = np.zeros((count, RGB, RECIPE_WORDS), np.uint32)
-    reach_px, radius_px = np.empty((count, 4), np.int64), np.empty(count, np.int64)
-    peak_ratio, spread_px = np.empty(count), np.empty(count)
+    spread_px = np.empty(count)
+    of_nodes: dict[str, NDArray[Any]] = {
+        "node_reach_px": np.empty((n_nodes, 4), np.int64),
+        "node_radius_px": np.empty(n_nodes, np.int64),
+        "node_peak_ratio": np.empty(n_nodes),
+    }
+    inputs = {
+        "fields": listed.recipe_fields,
+        "layers": listed.recipe_layers,
+        "layer_dpt": layers.layer_dpt,
+        "layer_zero_dpt": np.ascontiguousarray(layers.layer_zero_dpt),
+        "near": listed.near,
+        "far": listed.far,
+    }
     missing = np.empty(store.psf_count, np.int64)
-    total_dpt = layers.layer_dpt[recipe_layers, None]
-    total_dpt = total_dpt + layers.layer_zero_dpt[recipe_fields]
+    scratch: dict[str, NDArray[Any]] = {
+        "reach_px": np.empty((count, 4), np.int64),
+        "radius_px": np.empty(count, np.int64),
+        "peak_ratio": np.empty(count),
+        "missing": missing,
+    }
     job = records.RecipeJob(
         tables=tables.record(),
         reads=layers.reads.record(),
         count=count,
-        **pointers(
-            fields=recipe_fields,
-            total_dpt=total_dpt,
-            words=recipes,
-            reach_px=reach_px,
-            radius_px=radius_px,
-            peak_ratio=peak_ratio,
-            spread_px=spread_px,
-            missing=missing,
-        ),
+        node_count=n_nodes,
+        **pointers(words=recipes, spread_px=spread_px, **inputs, **of_nodes, **scratch),
     )
     while True:
         store.frame_number += 1
@@ -274,21 +318,14 @@ def _node_kernels(
         if left.size:
             return MissingPsfs(left)
     return NodeKernels(
-        near=near,
-        far=far,
-        reach_px=np.maximum(reach_px[near], reach_px[far]),
-        radius_px=np.maximum(radius_px[near], radius_px[far]),
-        peak_ratio=np.maximum(peak_ratio[near], peak_ratio[far]),
+        near=listed.near,
+        far=listed.far,
+        reach_px=of_nodes["node_reach_px"],
+        radius_px=of_nodes["node_radius_px"],
+        peak_ratio=of_nodes["node_peak_ratio"],
         recipes=recipes,
         recipe_spread_px=spread_px,
     )
-
-
-def pair_index(kernels: FrameKernels, shape: tuple[int, int]) -> NDArray[np.uint32]:
-    """Return the kernel index (n_cells, n_intervals) of each pair; 0 if unused."""
-    index = np.zeros(shape, dtype=np.uint32)
-    index[kernels.cells, kernels.intervals] = np.arange(kernels.count)
-    return index
 
 
 STEP_PX = 4

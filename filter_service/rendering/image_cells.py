@@ -155,6 +155,19 @@ class ImageCells:
         first, _, share = bracket_axis(self.centers_px[axis], places_px + 0.5)
         return first.astype(np.int32), share.astype(np.float32)
 
+    @cached_property
+    def weights(self) -> NDArray[np.float64]:
+        """The weights in C order."""
+        return np.ascontiguousarray(self.weight_ratio)
+
+    @cached_property
+    def read_nodes(self) -> NDArray[np.int64]:
+        """The nodes in C order, with the heaviest in place of those of weight 0."""
+        heaviest = self.weight_ratio.argmax(axis=1)[:, None]
+        heaviest = np.take_along_axis(self.nodes, heaviest, axis=1)
+        is_read = self.weight_ratio > 0.0
+        return np.ascontiguousarray(np.where(is_read, self.nodes, heaviest), np.int64)
+
     @property
     def count(self) -> int:
         """Number of cells."""

@@ -8,11 +8,11 @@ import pytest
 
 from estimator.profiles.measured_wavefront import MeasuredWavefront
 from estimator.profiles.parse import parse_profile
-from filter_service.constants import RECIPE_TAPS, RGB
+from filter_service.constants import MAX_LEVEL, RECIPE_TAPS, RGB
 from filter_service.native import loops, records
 from filter_service.planning.plan import unchecked_plan
 from filter_service.psfs.frame_layers import frame_layers
-from filter_service.psfs.pack import PackedKernels, layer_blur_px
+from filter_service.psfs.pack import PackedKernels, box_sizes, layer_blur_px
 from filter_service.psfs.store import PsfStore
 from filter_service.rendering import frame_kernels
 from filter_service.rendering.image_cells import CellMaps, image_cells
@@ -201,6 +201,33 @@ def test_kernels_equal_the_plain_statement(case):
                 np.testing.assert_allclose(found, values, RTOL, RTOL, err_msg=name)
             else:
                 np.testing.assert_array_equal(found, values, err_msg=name)
+    pairs = expected["cells"], expected["intervals"]
+    numbers = np.zeros(used.shape)
+    numbers[pairs] = np.arange(kernels.count)
+    np.testing.assert_array_equal(kernels.kernel_of, numbers)
+
+
+def test_shapes_of_kernels(rng):
+    """Sizes, spreads, and the highest level that a spread allows, at its limits too."""
+    limits_px = 0.95 * 2.0 * 2.0 ** np.arange(-1, 5)
+    spread_px = np.concatenate(
+        [rng.uniform(0.0, 40.0, (500, 2)), np.stack([limits_px, limits_px], axis=1)]
+    )
+    n = len(spread_px)
+    reach_px, radius_px = rng.integers(0, 256, (n, 4)), rng.integers(0, 400, n)
+    shapes = np.empty(n, records.KERNEL_SHAPE)
+    n_texels = loops().call(
+        *("fill_shapes", spread_px, radius_px, reach_px, n, 2.0, shapes.view(np.uint8))
+    )
+    assert n_texels == np.prod(box_sizes(reach_px), axis=0).sum()
+    steps = np.floor(np.log2(spread_px.max(axis=1) / (0.95 * 2.0))) + 1
+    highest = np.clip(steps, 0, MAX_LEVEL)
+    highest[500:] = 0, 1, 2, 3, 3, 3
+    np.testing.assert_array_equal(shapes["highest_level"], highest)
+    np.testing.assert_array_equal(shapes["spread_px"], spread_px.astype(np.float32))
+    np.testing.assert_array_equal(shapes["reach_px"], reach_px)
+    np.testing.assert_array_equal(shapes["radius_px"], radius_px)
+    assert not shapes["levels_used"].any()
 
 
 def test_a_measured_wavefront_has_one_defocus_over_the_field():
@@ -238,8 +265,9 @@ def maps_of_kernels(maps, spread_px):
         "node_reach_px": np.full((n, 4), 5),
         "node_radius_px": np.full(n, 5),
         "node_peak_ratio": np.ones(n),
-        "near_spread_px": spread_px,
-        "far_spread_px": spread_px + 0.5,
+        "near": np.arange(n),
+        "far": np.arange(n, 2 * n),
+        "recipe_spread_px": np.append(spread_px, spread_px + 0.5),
     }
     found = {
         "weight_ratio": np.empty((n, 2, 3)),

@@ -124,6 +124,7 @@ def test_numbers_of_rims_are_those_of_python():
         (SOURCE / "kernel_job.h", "store_tables", records.StoreTables),
         (SOURCE / "kernel_job.h", "state_reads", records.StateReads),
         (SOURCE / "kernel_job.h", "map_tables", records.MapTables),
+        (SOURCE / "kernel_job.h", "list_job", records.ListJob),
         (SOURCE / "kernel_job.h", "recipe_job", records.RecipeJob),
         (SOURCE / "kernel_job.h", "size_job", records.SizeJob),
         (SOURCE / "edge_job.h", "visibility_job", records.VisibilityJob),

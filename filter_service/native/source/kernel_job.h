@@ -28,17 +28,35 @@ typedef struct {
     const double *area_ratio, *box_ratio, *stretch_ratio, *change_ratio;
 } map_tables;
 
+/* Kernels of pairs of cell and interval, and what they consist of; see KernelList in
+ * frame_kernels.py. */
+typedef struct {
+    const uint8_t *used;      /* (n_cells, n_intervals) */
+    const int64_t *cell_nodes;                  /* (n_cells, 3) */
+    int64_t n_cells, n_intervals, n_fields, n_layers;
+    int64_t *cells, *intervals, *parts;         /* (count,), (count, 3) */
+    uint32_t *kernel_of;      /* (n_cells, n_intervals), zero before */
+    int64_t *fields, *node_intervals;           /* of node kernels */
+    int64_t *near, *far;      /* their recipes */
+    int64_t *recipe_fields, *recipe_layers;
+    int64_t *marks;           /* scratch (n_fields, max(n_intervals, n_layers)), zero before */
+    int64_t count, node_count, recipe_count;    /* results */
+} list_job;
+
 /* Recipes of field nodes at layers; see NodeKernels in frame_kernels.py. */
 typedef struct {
     store_tables tables;
     state_reads reads;
-    const int64_t *fields;    /* equal ones are adjacent */
-    const double *total_dpt;  /* (count, 3), ascending within a field node */
+    const int64_t *fields, *layers;             /* ascending; equal fields are adjacent */
+    const double *layer_dpt, *layer_zero_dpt;   /* (n_layers,), (n_fields, 3) */
     uint32_t *words;          /* (count, 3, 3, RECIPE_TAPS), zero before */
     int64_t *reach_px, *radius_px;              /* (count, 4), (count,) */
     double *peak_ratio, *spread_px;
+    const int64_t *near, *far;                  /* recipes of node kernels (m,) */
+    int64_t *node_reach_px, *node_radius_px;    /* of node kernels: (m, 4), (m,) */
+    double *node_peak_ratio;
     int64_t *missing;         /* unique PSFs that are not computed */
-    int64_t count;
+    int64_t count, node_count;
     uint32_t frame_number;    /* written to last_used of each PSF that is read */
 } recipe_job;
 
@@ -48,7 +66,9 @@ typedef struct {
     const double *cell_weight_ratio;            /* (n_cells, 3) */
     const int64_t *cells, *parts;               /* (count,), (count, 3) */
     const int64_t *node_reach_px, *node_radius_px;  /* of node kernels: (m, 4), (m,) */
-    const double *node_peak_ratio, *near_spread_px, *far_spread_px;
+    const double *node_peak_ratio;
+    const int64_t *near, *far;                  /* recipes of node kernels */
+    const double *recipe_spread_px;
     double *weight_ratio, *maps;                /* (count, 2, 3), (count, 2, 3, 2, 2) */
     int64_t *reach_px, *radius_px;              /* (count, 4), (count,) */
     double *peak_ratio, *spread_px;             /* (count,), (count, 2) */

@@ -25,4 +25,5 @@ EXPORT void ocu_sizes(int32_t *sizes) {
     sizes[n++] = (int32_t)sizeof(omitted_job);
     sizes[n++] = (int32_t)sizeof(light_job);
     sizes[n++] = (int32_t)sizeof(node_job);
+    sizes[n++] = (int32_t)sizeof(list_job);
 }

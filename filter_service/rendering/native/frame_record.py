@@ -4,20 +4,20 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
+from estimator.native.records import pointer_to
 from filter_service.constants import (
     FIELD_CORNERS,
     MAX_LEVEL,
-    MERGE_FADE_RATIO,
     MIN_BLUR_RANGE,
-    MIN_SPREAD_PX,
     TILE_SIZE_PX,
 )
-from filter_service.native import Loops
+from filter_service.native import Loops, loops
 from filter_service.native.records import (
     BLOCK,
     CLUSTER_BYTES,
@@ -41,7 +41,6 @@ from filter_service.rendering.frame_kernels import (
     MissingPsfs,
     frame_kernels,
     interval_count,
-    pair_index,
 )
 from filter_service.rendering.frame_states import FrameStore
 from filter_service.rendering.image_cells import ImageCells, check_texels, image_cells
@@ -203,20 +202,17 @@ class KernelPlan:
     used : (n_cells, n_intervals), bool
         Pairs that have a kernel.
     kernels : FrameKernels
-    kernel_of : (n_cells, n_intervals), uint32
     shapes : (n,), KERNEL_SHAPE
         The stage `merge` writes `levels_used`.
-    sources : tuple of arrays
-        Contiguous inputs of the stage `blend`: cells, parts, near and far recipes,
-        weights, maps, recipes.
+    sources : dict of arrays
+        Contiguous inputs of the stages by the names of their pointers in `Frame`.
     """
 
     state: tuple[NativeStore, FrameLayers, ImageCells]
     used: NDArray[np.bool_]
     kernels: FrameKernels
-    kernel_of: NDArray[np.uint32]
     shapes: NDArray[np.void]
-    sources: tuple[NDArray[Any], ...]
+    sources: dict[str, NDArray[Any]]
 
     def serves(self, state: tuple[object, ...], used: NDArray[np.bool_]) -> bool:
         """Return whether the plan is for this state and has a kernel for each pair."""
@@ -244,35 +240,42 @@ def plan_kernels(
     )
     if isinstance(kernels, MissingPsfs):
         return kernels
-    widths, heights = box_sizes(kernels.reach_px)
-    check_texels(int((widths * heights).sum()), image, handle.store.spec)
+    shapes = np.empty(kernels.count, KERNEL_SHAPE)
+    n_texels = loops().call(
+        "fill_shapes",
+        *(kernels.spread_px, kernels.radius_px, kernels.reach_px, kernels.count),
+        *(layers.merge_spread_px, shapes.view(np.uint8)),
+    )
+    check_texels(n_texels, image, handle.store.spec)
     nodes = kernels.nodes
-    sources = (kernels.cells, kernels.parts, nodes.near, nodes.far)
     return KernelPlan(
         state=(handle, layers, image),
         used=used,
         kernels=kernels,
-        kernel_of=pair_index(kernels, used.shape),
-        shapes=_shapes(kernels, layers.merge_spread_px),
-        sources=(
-            *(np.ascontiguousarray(numbers, np.int64) for numbers in sources),
-            np.ascontiguousarray(kernels.weight_ratio, np.float64),
-            np.ascontiguousarray(kernels.maps, np.float64),
-            np.ascontiguousarray(nodes.recipes, np.uint32),
-        ),
+        shapes=shapes,
+        sources={
+            "kernel_of": kernels.kernel_of,
+            "shapes": shapes.view(np.uint8),  # structured types take longer to describe
+            "kernel_cells": kernels.cells,
+            "kernel_parts": kernels.parts,
+            "node_near": nodes.near,
+            "node_far": nodes.far,
+            "part_weights": kernels.weight_ratio,
+            "part_maps": kernels.maps,
+            "recipes": nodes.recipes,
+        },
     )
 
 
-def _shapes(kernels: FrameKernels, merge_spread_px: float) -> NDArray[np.void]:
-    shapes = np.zeros(kernels.count, KERNEL_SHAPE)
-    shapes["spread_px"] = kernels.spread_px
-    shapes["radius_px"] = kernels.radius_px
-    shapes["reach_px"] = kernels.reach_px
-    widest_px = np.maximum(kernels.spread_px.max(axis=1), MIN_SPREAD_PX)
-    least_px = (1.0 - MERGE_FADE_RATIO) * merge_spread_px
-    steps = np.floor(np.log2(widest_px / least_px)) + 1
-    shapes["highest_level"] = np.clip(steps, 0, MAX_LEVEL)
-    return shapes
+@lru_cache(maxsize=8)
+def _columns(
+    width: int, border_px: int, image_width: int, cell_px: int
+) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
+    """Return the cell (width,) of each column, and its place in the cell, 0 to 1."""
+    column = np.clip(np.arange(width) - border_px, 0, image_width - 1)
+    cell, place = np.divmod(column, cell_px)
+    share = (place + np.float32(0.5)) / np.float32(cell_px)
+    return cell.astype(np.int32), share.astype(np.float32)
 
 
 SPARE_RATIO = 1.25
@@ -284,6 +287,7 @@ class Arrays:
 
     def __init__(self) -> None:
         self._arrays: dict[str, NDArray[Any]] = {}
+        self._addresses: dict[str, int] = {}
 
     def get(self, name: str, count: int, dtype: DTypeLike) -> NDArray[Any]:
         """Return a named array of at least ``count`` elements, not initialized.
@@ -294,11 +298,13 @@ class Arrays:
         if array is None or array.size < count:
             self._arrays.pop(name, None)  # frees it before the next allocation
             array = self._arrays[name] = np.empty(int(SPARE_RATIO * count) + 1, dtype)
+            self._addresses[name] = int(array.ctypes.data)
         return array
 
     def address(self, name: str, count: int, dtype: DTypeLike) -> int:
         """Return the address of a named array."""
-        return int(self.get(name, count, dtype).ctypes.data)
+        self.get(name, count, dtype)
+        return self._addresses[name]
 
     @property
     def memory_mb(self) -> float:
@@ -358,7 +364,7 @@ class FrameRecord:
     def _pointer_to(self, array: NDArray[Any]) -> int:
         """Return the address of an array, and keep the array alive with the record."""
         self.referenced.append(array)
-        return int(array.ctypes.data)
+        return pointer_to(array)
 
     def _buffer(self, name: str, count: int, dtype: DTypeLike = np.uint8) -> int:
         return self.arrays.address(name, count, dtype)
@@ -412,11 +418,9 @@ class FrameRecord:
             "row_scratch", self.n_threads * (c.cell_columns + 1), np.float32
         )
         if image.cell_px:
-            column = np.clip(np.arange(c.width) - c.border_px, 0, c.image_width - 1)
-            cell, place = np.divmod(column, image.cell_px)
-            c.column_cell = self._pointer_to(cell.astype(np.int32))
-            share = (place + np.float32(0.5)) / np.float32(image.cell_px)
-            c.column_share = self._pointer_to(share.astype(np.float32))
+            cell, share = _columns(c.width, c.border_px, c.image_width, image.cell_px)
+            c.column_cell = self._pointer_to(cell)
+            c.column_share = self._pointer_to(share)
         c.block_slots = BLOCK_PIXELS
         if image.blends:
             c.block_slots *= FIELD_CORNERS
@@ -443,8 +447,6 @@ class FrameRecord:
     def set_kernels(self, plan: KernelPlan) -> None:
         """Set pointers to the planned kernels and to buffers for fragments."""
         c = self.c
-        c.kernel_of = self._pointer_to(plan.kernel_of)
-        c.shapes = self._pointer_to(plan.shapes)
         c.kernel_count = plan.kernels.count
         reach_px = float(plan.kernels.reach_px.max())
         c.largest_reach_px = reach_px + REACH_MARGIN_PX + COARSE_MARGIN_PX
@@ -464,10 +466,7 @@ class FrameRecord:
                 f"boxes {side}", n_clusters + BOX_PADDING_COUNT, np.int16
             )
         c.blocks = self._buffer("blocks", n_blocks, BLOCK)
-        names = ("kernel_cells", "kernel_parts", "node_near", "node_far")
-        for name, array in zip(
-            (*names, "part_weights", "part_maps", "recipes"), plan.sources, strict=True
-        ):
+        for name, array in plan.sources.items():
             setattr(c, name, self._pointer_to(array))
         c.recipe_count = len(plan.kernels.nodes.recipes)
         n_images = RESOLUTIONS * c.recipe_count
