@@ -141,7 +141,6 @@ def frame_kernels(
     fill : callable, optional
         Function that computes missing PSFs; `PsfStore.fill` by default.
     """
-    maps = image.maps.tables
     listed = _list_kernels(used, layers, image)
     nodes = _node_kernels(
         store, tables or store.tables, fill or store.fill, layers, listed
@@ -169,7 +168,7 @@ def frame_kernels(
         "spread_px": np.zeros((cells.size, 2)),
     }
     job = records.SizeJob(
-        cell_maps=records.MapTables(**pointers(**maps._asdict())),
+        cell_maps=image.maps.record,
         count=cells.size,
         **pointers(**inputs, **found),
     )

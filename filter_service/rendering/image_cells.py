@@ -18,7 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from filter_service.constants import FIELD_CORNERS
-from filter_service.native import loops
+from filter_service.native import loops, records
+from filter_service.native.records import pointers
 from filter_service.planning.grid import GridSpec, field_deg
 from filter_service.planning.nodes import PlanAxes, bracket_axis, triangle
 
@@ -72,6 +73,11 @@ class CellMaps:
         inverse = np.empty_like(maps)
         loops().call("map_ratios", maps, maps.size // 4, inverse, ratios)
         return MapTables(maps, inverse, *ratios)
+
+    @cached_property
+    def record(self) -> records.MapTables:
+        """The tables as a C record."""
+        return records.MapTables(**pointers(**self.tables._asdict()))
 
     @property
     def largest_stretch_ratio(self) -> float:

@@ -6,6 +6,9 @@
 #include "frame.h"
 #include "vectors.h"
 
+/* Smaller depth is missing; as in rgbd_view.py. */
+#define MIN_DEPTH_M 1e-6f
+
 /* Marks a pair as used; reads first, because most pixels find it marked. */
 INLINE void note_use(uint8_t *mark) {
     if (!__atomic_load_n(mark, __ATOMIC_RELAXED)) __atomic_store_n(mark, 1, __ATOMIC_RELAXED);
@@ -197,7 +200,8 @@ INLINE void compute_run(pixel_line *line, pixel_run run) {
         if (run.is_in_image) {
             i32x8 outside = holds & ((dpt < low_limit) | (dpt > high_limit));
             line->clamped += __builtin_popcount(bits_of8(outside) & all);
-            line->missing += __builtin_popcount(~bits_of8(holds) & all);
+            i32x8 is_known = depth_m >= all8(MIN_DEPTH_M);
+            line->missing += __builtin_popcount(~bits_of8(is_known) & all);
         }
         dpt = smaller8(high, larger8(low, dpt));
         if (line->seen_dpt != NULL) {
