@@ -127,7 +127,7 @@ def frame_kernels(
     image: ImageCells,
     used: NDArray[np.bool_],
     *,
-    tables: StoreTables | None = None,
+    tables_of: Callable[[], StoreTables] | None = None,
     fill: Fill | None = None,
 ) -> FrameKernels | MissingPsfs:
     """Plan the kernels of used (cell, interval) pairs, and compute missing PSFs.
@@ -136,14 +136,19 @@ def frame_kernels(
     ----------
     store : PsfStore
     used : (n_cells, n_intervals)
-    tables : StoreTables, optional
-        Tables to use instead of the store's; their offsets are written to the recipes.
+    tables_of : callable, optional
+        Returns the current tables to use instead of the store's; their offsets are
+        written to the recipes.
     fill : callable, optional
         Function that computes missing PSFs; `PsfStore.fill` by default.
     """
     listed = _list_kernels(used, layers, image)
     nodes = _node_kernels(
-        store, tables or store.tables, fill or store.fill, layers, listed
+        store,
+        tables_of or (lambda: store.tables),
+        fill or store.fill,
+        layers,
+        listed,
     )
     if isinstance(nodes, MissingPsfs):
         return nodes
@@ -191,7 +196,9 @@ def missing_psfs(
 ) -> NDArray[np.int64]:
     """Return the indices (n,) of needed PSFs that have not been computed yet."""
     listed = _list_kernels(used, layers, image)
-    found = _node_kernels(store, store.tables, lambda psfs: psfs, layers, listed)
+    found = _node_kernels(
+        store, lambda: store.tables, lambda psfs: psfs, layers, listed
+    )
     return found.psfs if isinstance(found, MissingPsfs) else np.zeros(0, np.int64)
 
 
@@ -271,7 +278,7 @@ def _list_kernels(
 
 def _node_kernels(
     store: PsfStore,
-    tables: StoreTables,
+    tables_of: Callable[[], StoreTables],
     fill: Fill,
     layers: FrameLayers,
     listed: KernelList,
@@ -300,6 +307,7 @@ def _node_kernels(
         "peak_ratio": np.empty(count),
         "missing": missing,
     }
+    tables = tables_of()
     job = records.RecipeJob(
         tables=tables.record(),
         reads=layers.reads.record(),
@@ -316,6 +324,9 @@ def _node_kernels(
         left = fill(missing[:n_missing].copy())
         if left.size:
             return MissingPsfs(left)
+        # In a pause of `fill`, another state may have been planned.
+        tables = tables_of()
+        job.tables = tables.record()
     return NodeKernels(
         near=listed.near,
         far=listed.far,

@@ -549,6 +549,26 @@ def test_a_first_frame_is_guessed(known):
     assert 0 < handle.missing_psfs(use).size < handle.missing_psfs().size
 
 
+def test_another_state_may_be_planned_while_a_frame_computes_psfs(streamed):
+    """In a pause, by the thread that prepares eyes: the tables are replaced."""
+    from filter_service.rendering.image_cells import image_cells
+
+    eye, spec, plan = streamed
+    store = PsfStore(eye, spec, plan)
+    layers = frame_layers(store, State(pupil_diameter_mm=4.0, focus_dpt=0.0))
+    image = image_cells(spec, plan)
+    used = np.ones((image.count, interval_count(layers)), bool)
+    others = [(k, 0) for k in range(len(plan.pupils_mm))][::-1]
+
+    def fill(psfs):
+        store.groups_of([others.pop(0)])
+        return store.fill(psfs)
+
+    found = frame_kernels(store, layers, image, used, fill=fill)
+    assert found.count == used.sum()
+    assert len(others) == len(plan.pupils_mm) - 1, "the PSFs were not found"
+
+
 def test_a_plan_without_time_asks_for_what_it_lacks(known):
     eye, spec, plan = known
     store = PsfStore(eye, spec, plan)

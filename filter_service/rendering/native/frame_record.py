@@ -236,7 +236,7 @@ def plan_kernels(
         There are too many texels, and larger cells are possible.
     """
     kernels = frame_kernels(
-        handle.store, layers, image, used, tables=handle.tables, fill=fill
+        handle.store, layers, image, used, tables_of=lambda: handle.tables, fill=fill
     )
     if isinstance(kernels, MissingPsfs):
         return kernels
