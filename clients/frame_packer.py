@@ -109,7 +109,7 @@ class FramePacker:
             result_slot.slot.number,
             tuple(result_starts),
         )
-        return replace(frame, memory=places), [slot, result_slot]
+        return frame.changed(frame, memory=places), [slot, result_slot]
 
     def lend_view(
         self,

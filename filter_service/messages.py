@@ -51,6 +51,7 @@ from filter_service.wire.message import (
     Limits,
     Message,
     Part,
+    plain_message,
     unpack_header,
 )
 from filter_service.wire.replies import (
@@ -271,9 +272,18 @@ def decode_request(
         raise limits.with_limits(error) from None
 
 
+NO_LIMITS = Limits()
+
+
 def decode_reply(parts: Sequence[Part]) -> Message:
-    """Decode and validate a message of the service; raises as `decode_request` does."""
-    return _decoded(parts, REPLIES, Limits())
+    """Decode and validate a message of the service; raises as `decode_request` does.
+
+    Keys that appear twice are only found in messages that are invalid otherwise.
+    """
+    found = plain_message(parts[0], REPLIES, PROTOCOL_VERSION) if parts else None
+    if found is not None:
+        return found.with_parts(parts[1:], NO_LIMITS)
+    return _decoded(parts, REPLIES, NO_LIMITS)
 
 
 def _decoded(

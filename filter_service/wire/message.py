@@ -5,10 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from typing import Annotated, Any, ClassVar, Self
 
 import msgpack
-from msgspec import Meta
+from msgspec import Meta, MsgspecError, Struct
+from msgspec import msgpack as msgspec_msgpack
 
 from filter_service.errors import BadMessage
 from filter_service.validation import Record, checked, show
@@ -404,6 +406,40 @@ class Message(Record):
 
     def _with_payload(self, value: object) -> Self:
         return self.changed(self, **{self.payload: value})
+
+
+class _Head(Struct):
+    """The fields that all messages have."""
+
+    type: str
+    version: int
+
+
+@cache
+def _decoder(kind: Any) -> msgspec_msgpack.Decoder[Any]:
+    return msgspec_msgpack.Decoder(kind)
+
+
+def plain_message(
+    data: Part, kinds: Mapping[str, type[Message]], version: int
+) -> Message | None:
+    """Return the message of a header of the service, without its parts.
+
+    This takes half the time of `unpack_header` and `Message.parse`, and validates all
+    known fields; it does not look for repeated keys and strange values of others.
+    Returns None for a header that those have to examine.
+    """
+    if memoryview(data).nbytes > MAX_HEADER_BYTES:
+        return None
+    try:
+        head = _decoder(_Head).decode(data)
+        if head.version != version or head.type not in kinds:
+            return None
+        kind: Any = kinds[head.type]  # mypy takes no class with fields as hashable
+        found: Message = _decoder(kind).decode(data)
+    except MsgspecError:
+        return None
+    return None if getattr(found, found.payload, ()) else found
 
 
 def expect_parts(parts: Sequence[Part], count: int) -> None:

@@ -12,6 +12,7 @@ from filter_service import errors, messages
 from filter_service.messages import (
     LINEAR,
     LINEAR16,
+    PROTOCOL_VERSION,
     SRGB8,
     Limits,
     ProfileRequest,
@@ -23,6 +24,7 @@ from filter_service.messages import (
 )
 from filter_service.service.frame_reply import images_in
 from filter_service.shared_memory import Slot, aligned_starts
+from filter_service.wire.message import plain_message
 from filter_service.wire.requests import frame_of
 from tests.unit.message_parts import (
     CAMERA,
@@ -46,6 +48,15 @@ def test_what_a_client_says_arrives_unchanged(message):
 @pytest.mark.parametrize("message", REPLIES, ids=lambda m: m.type_name)
 def test_what_the_service_says_arrives_unchanged(message):
     assert decode_reply(as_bytes(encode(message))) == message
+
+
+@pytest.mark.parametrize("message", REPLIES, ids=lambda m: m.type_name)
+def test_a_plain_reply_is_read_as_one_that_is_examined(message, monkeypatch):
+    parts = as_bytes(encode(message))
+    assert plain_message(parts[0], messages.REPLIES, PROTOCOL_VERSION) is not None
+    plain = decode_reply(parts)
+    monkeypatch.setattr(messages, "plain_message", lambda *_: None)
+    assert decode_reply(parts) == plain == message
 
 
 @pytest.mark.parametrize(
