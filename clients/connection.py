@@ -19,6 +19,7 @@ from filter_service.keys import ClientKey
 from filter_service.waiting import Wait
 
 READABLE = int(zmq.POLLIN)
+NO_WAIT, NO_WAIT_MORE = int(zmq.NOBLOCK), int(zmq.NOBLOCK | zmq.SNDMORE)
 COPY_BELOW_BYTES = 65536  # pyzmq always copies smaller parts
 MAX_BUFFERS_PER_SIZE = 8
 HEARTBEAT_INTERVAL_MS = 500
@@ -224,7 +225,7 @@ class Connection:
         """
         last = len(parts) - 1
         for i, part in enumerate(parts):
-            flags = zmq.NOBLOCK | (zmq.SNDMORE if i < last else 0)
+            flags = NO_WAIT_MORE if i < last else NO_WAIT
             n_bytes = memoryview(part).nbytes
             is_large = n_bytes >= COPY_BELOW_BYTES
             try:
