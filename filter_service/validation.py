@@ -55,15 +55,18 @@ class Record:
     def fields(self) -> dict[str, Any]:
         """Return the map, with lists for tuples, without fields that are None."""
         return {
-            name: _plain(value)
+            name: value if type(value) in SCALARS else _plain(value)
             for name, value in vars(self).items()
             if value is not None
         }
 
 
+SCALARS = frozenset((bool, int, float, str, bytes))
+
+
 def _plain(value: Any) -> Any:
     if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
+        return [item if type(item) in SCALARS else _plain(item) for item in value]
     return value.fields() if isinstance(value, Record) else value
 
 
