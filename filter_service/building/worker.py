@@ -43,6 +43,10 @@ PROGRESS_INTERVAL_S = 0.1
 MAX_STORES = 4
 """Number of built stores whose nodes the worker still plans ahead."""
 
+URGENT_PARTS, REST_RATIO = 3, 2.0
+"""Number of parts near a state that are planned without a rest, and the rests after the
+others relative to their duration, which leave the cores to frames."""
+
 log = logging.getLogger("ocufilter.worker")
 
 
@@ -68,21 +72,28 @@ def serve_builds(pipe: Connection, build_name: str) -> None:
         requests = _Requests(pipe)
         built: dict[int, tuple[BuiltStore, BuildJob]] = {}
         parts: Iterator[tuple[Any, ...]] = iter(())
+        n_parts, rest_s = 0, 0.0
         while True:
-            part = None if requests.has_next() else next(parts, None)
+            started_s = time.monotonic()
+            part = None if requests.has_next(rest_s) else next(parts, None)
             if part is not None:
                 pipe.send(part)
+                n_parts += 1
+                took_s = time.monotonic() - started_s - rest_s
+                rest_s = REST_RATIO * took_s if n_parts > URGENT_PARTS else 0.0
                 continue
-            kind, ticket, argument = requests.next()
+            n_parts, rest_s = 0, 0.0
+            kind, ticket, *arguments = requests.next()
             if kind == "build":
-                found = _build_one(requests, build, ticket=ticket, job=argument)
+                found = _build_one(requests, build, ticket=ticket, job=arguments[0])
                 if isinstance(found, BuiltStore):
-                    kept = ticket, (replace(found, parts=()), argument)
+                    kept = ticket, (replace(found, parts=()), arguments[0])
                     built = dict([*built.items(), kept][-MAX_STORES:])
-                    parts = _parts_ahead(found, ticket, argument)
+                    parts = _parts_ahead(found, ticket, arguments[0])
             elif kind == "near" and ticket in built:
                 found, job = built[ticket]
-                parts = _parts_ahead(found, ticket, replace(job, near=argument))
+                job = replace(job, near=arguments[0])
+                parts = _parts_ahead(found, ticket, job)
     except (EOFError, OSError, ParentExited):
         return
 
@@ -94,17 +105,14 @@ class _Requests:
         self.pipe = pipe
         self._waiting: deque[Any] = deque()
 
-    def has_next(self) -> bool:
-        """Return whether a message waits."""
-        return bool(self._waiting) or self.pipe.poll(0)
+    def has_next(self, timeout_s: float) -> bool:
+        """Return whether a message arrives before a timeout."""
+        return bool(self._waiting) or self.pipe.poll(timeout_s)
 
-    def next(self) -> tuple[str, int, Any]:
-        """Return the next message that is not the cancellation of an ended build."""
-        while True:
-            message = self._waiting.popleft() if self._waiting else self.pipe.recv()
-            if message[0] != "cancel":
-                kind, ticket, argument = message
-                return kind, ticket, argument
+    def next(self) -> tuple[Any, ...]:
+        """Return the next message, which may cancel a build that has ended."""
+        message = self._waiting.popleft() if self._waiting else self.pipe.recv()
+        return tuple(message)
 
     def is_cancelled(self, ticket: int) -> bool:
         """Return whether the parent has canceled a build; takes 2 us if not."""
