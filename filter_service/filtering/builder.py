@@ -74,9 +74,10 @@ CHECK_LIMIT, CHECK_GROWTH = 256, 4
 """Number of missing PSFs that the second check allows, and the factor by which each
 later one allows more.  A pupil that keeps moving needs new PSFs at every check."""
 
-FIRST_SHARE, PSF_S = 0.35, 1.5e-5
-"""The first frame through a new eye may compute PSFs in this share of its duration, at
-so much time each.  On two cores, it computes them in a third of the time that the
+FIRST_SHARES, PSF_S = (0.35, 1.0), 1.5e-5
+"""The first frame through a new eye may compute PSFs in these shares of its duration:
+of those that the first check found, and of those that later ones find, because pupil
+and focus move on.  Each takes so much time on two cores, a third of the time that the
 thread takes beside frames."""
 
 BUSY_SHARE = 0.4
@@ -463,7 +464,7 @@ class Builder:
             self._loads.append(
                 StoreLoad(
                     *(self.engine, stream, target, event.ticket, event.built),
-                    enough=self._frame_psfs,
+                    enough=self._frame_psfs[0],
                 )
             )
         elif isinstance(event, BuildError):
@@ -513,10 +514,9 @@ class Builder:
                 *(store, prepared.camera, eye.settings, stream.history),
                 is_first_check=not prepared.n_checks,
             )
-            allowed, enough = 0, self._frame_psfs
-            if prepared.n_checks:
-                grown = CHECK_LIMIT * CHECK_GROWTH ** (prepared.n_checks - 1)
-                allowed = max(grown, enough)
+            enough = self._frame_psfs[min(prepared.n_checks, 1)]
+            grown = int(CHECK_LIMIT * CHECK_GROWTH ** (prepared.n_checks - 1))
+            allowed = max(grown, enough) if prepared.n_checks else 0
             prepared.n_checks += 1
             prepared.work = None
             if psfs.size > allowed:
@@ -530,9 +530,9 @@ class Builder:
         self._set_ready(stream, eye, prepared)
 
     @property
-    def _frame_psfs(self) -> int:
+    def _frame_psfs(self) -> tuple[int, ...]:
         """Return how many PSFs the first frame through a new eye may compute."""
-        return int(FIRST_SHARE * self.frame_s / PSF_S)
+        return tuple(int(share * self.frame_s / PSF_S) for share in FIRST_SHARES)
 
     def _report_progress(
         self,
