@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from filter_service.camera import Camera
-from filter_service.filtering.stream_eyes import LEAD_S, SPEED_S, FrameHistory
+from filter_service.filtering.frame_history import SPEED_S, FrameHistory
 from filter_service.rendering.frame_kernels import STEP_PX, SampledView, first_frame
 from filter_service.rgbd_view import RgbdView
 from filter_service.settings import FilterSettings
@@ -27,20 +27,22 @@ def noted(states, interval_s=0.05):
     return history
 
 
-def predicted(history):
-    return [(s.pupil_diameter_mm, s.focus_dpt) for s in history.predicted_states()]
+def predicted(history, lead_s):
+    state = history.predicted(lead_s)
+    return state.pupil_diameter_mm, state.focus_dpt
 
 
-def test_states_go_on_at_their_speed():
+@pytest.mark.parametrize("lead_s", [0.06, 0.4])
+def test_states_go_on_at_their_speed(lead_s):
     history = noted([(4.0 + 0.1 * k, 2.0 - 0.05 * k) for k in range(20)])
-    expected = [(5.9 + 2.0 * lead_s, 1.05 - 1.0 * lead_s) for lead_s in LEAD_S]
-    np.testing.assert_allclose(predicted(history), expected, rtol=1e-9)
+    expected = (5.9 + 2.0 * lead_s, 1.05 - 1.0 * lead_s)
+    np.testing.assert_allclose(predicted(history, lead_s), expected, rtol=1e-9)
 
 
 def test_only_the_last_frames_tell_the_speed():
     n_last = int(SPEED_S / 0.05) + 2
     history = noted([(2.0, 0.0), (7.0, 5.0)] * 10 + [(4.0, 1.0)] * n_last)
-    np.testing.assert_allclose(predicted(history), [(4.0, 1.0)] * len(LEAD_S))
+    np.testing.assert_allclose(predicted(history, 0.1), (4.0, 1.0))
 
 
 def test_the_interval_is_that_of_the_last_frames():
@@ -50,11 +52,11 @@ def test_the_interval_is_that_of_the_last_frames():
 
 @pytest.mark.parametrize("count", [0, 1])
 def test_a_single_frame_tells_no_speed(count):
-    assert noted([(4.0, 1.0)] * count).predicted_states() == []
+    assert noted([(4.0, 1.0)] * count).predicted(0.1) is None
 
 
 def test_frames_at_the_same_time_tell_no_speed():
-    assert noted([(4.0, 1.0), (5.0, 2.0)], interval_s=0.0).predicted_states() == []
+    assert noted([(4.0, 1.0), (5.0, 2.0)], interval_s=0.0).predicted(0.1) is None
 
 
 def test_a_view_is_remembered_by_some_of_its_depths():
