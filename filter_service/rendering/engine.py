@@ -150,8 +150,9 @@ class ViewResult(FrameCounts, WithState):
         frame if the request waits, and otherwise one whose counts this result lacks.
     fragment_count, merged_count, entry_count : int
         Fragments, pixels merged into fragments, and entries of the bins' fragment
-        lists.  Rows shared by two strips of a very large frame count twice.  With a
-        hidden layer, the border counts too.
+        lists (in the engine `native`, fragments of the listed clusters).  Rows shared
+        by two strips of a very large frame count twice.  With a hidden layer, the
+        border counts too.
     kernel_count, kernel_texel_count : int
         Kernels of the frame, and texels of all their levels.
     """

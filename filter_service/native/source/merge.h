@@ -9,8 +9,7 @@
 typedef struct {
     f32x4 color;              /* linear RGB, dpt */
     float place;
-    uint32_t kernel;
-    int level, is_edge;
+    int is_edge;
     float strength, coverage; /* as of the fragment's light */
 } origin;
 
@@ -29,13 +28,12 @@ INLINE origin origin_of(const block *b, const block_squares *all, int i, int lev
     float coverage = b->surface == 0 ? 1.0f : share;
     if (level == 0)
         return (origin){{b->rgb[0][i], b->rgb[1][i], b->rgb[2][i], b->dpt[i]},
-                        b->place[i], b->kernel[i], 0, is_edge, strength, coverage};
+                        b->place[i], is_edge, strength, coverage};
     const square_row *s = &all->rows[level - 1][i / TILE_SIZE_PX >> level];
     int lane = i % TILE_SIZE_PX;
     return (origin){{lane_of(&s->mean[0], lane), lane_of(&s->mean[1], lane),
                      lane_of(&s->mean[2], lane), lane_of(&s->dpt, lane)},
-                    lane_of(&s->place, lane), all->kernel[i], level, is_edge, strength,
-                    coverage};
+                    lane_of(&s->place, lane), is_edge, strength, coverage};
 }
 
 /* Sort depth; smaller is nearer. */
