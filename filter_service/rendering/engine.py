@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from estimator.note import Note
 from filter_service.errors import BadMessage, CameraMismatch
 from filter_service.planning.grid import GridSpec
-from filter_service.rendering.frame import object_range_dpt
+from filter_service.rendering.frame import Merging, object_range_dpt
 from filter_service.rendering.frame_kernels import MissingPsfs
 from filter_service.rendering.frame_states import FrameStore
 from filter_service.rgbd_view import RgbdView
@@ -88,6 +88,12 @@ class ViewRequest:
     target_is_top_first: bool | None = None
     gain_ratio: tuple[float, float, float] = (1.0, 1.0, 1.0)
     waits: bool = False
+
+    @property
+    def merging(self) -> Merging:
+        """How the frame merges pixels."""
+        mode = self.handle.store.spec.settings.mode
+        return Merging.of(self.options, self.state.gaze_deg, mode)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -8,10 +8,14 @@ from scipy.ndimage import zoom
 from estimator.profiles.parse import parse_profile
 from filter_service.psfs.frame_layers import frame_layers
 from filter_service.psfs.store import build_psf_store
+from filter_service.rendering.frame import MODE_TOLERANCE_RATIO
 from filter_service.rgbd_view import RgbdView
 from filter_service.view_state import State
 from tests.grid_specs import grid_spec
 from tests.numerical.plan_twin import layer_blur_px
+
+AS_DYNAMIC = 1.0 / MODE_TOLERANCE_RATIO["on-axis"]
+"""Tolerance at which frames on the axis merge as in the mode "dynamic"."""
 
 
 def tangents(width_px, height_px, vertical_fov_deg):

@@ -6,6 +6,7 @@ import pytest
 from filter_service import constants as c
 from filter_service.planning.grid import unit_direction
 from filter_service.rendering.frame import (
+    MODE_TOLERANCE_RATIO,
     detection_gain,
     smallest_spread_px,
     white_level,
@@ -21,6 +22,8 @@ SIZE = 160
 FOV_DEG = 90.0
 ROUNDING_RATIO = 3e-4
 """Of float32 in the spread of a kernel and in the gain."""
+
+ON_AXIS_CONTRAST = MODE_TOLERANCE_RATIO["on-axis"] * c.MERGE_CONTRAST
 
 REACH_DEG = 3.0
 """From the gaze's margin inward: a block, and the kernels around it."""
@@ -46,7 +49,7 @@ def bench(engine):
 @pytest.fixture
 def color(rng):
     """Texture of low contrast, so that blocks differ in how far they merge."""
-    contrast = np.linspace(0.0, 0.25, SIZE)[:, None, None]
+    contrast = np.linspace(0.0, 0.06, SIZE)[:, None, None]
     return (0.4 + contrast * texture(rng, SIZE, SIZE)).astype(np.float32)
 
 
@@ -89,7 +92,7 @@ def merged_squares(linear, spread, gain):
         is_whole = is_whole.reshape(shape).all(axis=(1, 3))
         factor = gain.repeat(8 >> level, axis=0).repeat(8 >> level, axis=1)
         scaled = spread / 2 ** (level - 1)
-        most = white * factor * c.MERGE_CONTRAST * scaled**c.MERGE_CONTRAST_POWER
+        most = ON_AXIS_CONTRAST * factor * white * scaled**c.MERGE_CONTRAST_POWER
         is_whole = is_whole & (scaled >= smallest_spread_px(factor))
         is_whole &= (high - low).max(axis=-1) <= most
         pixels = is_whole.repeat(2**level, axis=0).repeat(2**level, axis=1)

@@ -14,6 +14,7 @@ from filter_service.planning.nodes import (
     bracket_axis,
 )
 from filter_service.planning.plan import (
+    QUALITY_DB,
     TOLERANCE_DB,
     PlanTooLarge,
     plan_cache,
@@ -309,6 +310,16 @@ def test_errors_are_predicted_behind_a_lens_with_several_foci():
     plan = plan_cache(eye, spec)
     found_db = measured_db(eye, spec, plan)
     assert found_db == pytest.approx(plan.prediction.interpolation_db, abs=3.0)
+
+
+def test_quality_errs_half_as_much_as_dynamic_in_a_state():
+    plans = {}
+    for mode in ("dynamic", "quality"):
+        spec = spec_for(mode=mode, **SMALL, **ONE_STATE)
+        plans[mode] = plan_cache(measured_eye("keratoconus"), spec).prediction
+    assert plans["dynamic"].interpolation_db > TOLERANCE_DB["normal"] - 0.5
+    assert plans["quality"].interpolation_db > QUALITY_DB["normal"] - 0.5
+    assert plans["quality"].psf_count < 4.0 * plans["dynamic"].psf_count
 
 
 def test_foci_that_share_the_light_need_few_psfs():

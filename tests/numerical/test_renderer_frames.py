@@ -12,6 +12,7 @@ from filter_service.rgbd_view import RgbdView
 from tests.numerical.made_fragments import made_fragments
 from tests.numerical.one_kernel import OneKernelBench, disc
 from tests.numerical.synthetic import (
+    AS_DYNAMIC,
     Bench,
     assert_same_frame,
     depth_scene,
@@ -46,7 +47,7 @@ def test_layers_are_no_farther_apart_than_the_blur_step(bench):
 @pytest.mark.brief
 @pytest.mark.both_engines
 def test_merging_keeps_every_pixel_once(bench, view):
-    result = bench.render(view, pupil_diameter_mm=5.0)
+    result = bench.render(view, pupil_diameter_mm=5.0, render_tolerance=AS_DYNAMIC)
     made = made_fragments(bench, 150, 101)
     assert result.fragment_count == made.x.size
     assert np.square(made.edge_px)[made.edge_px > 1].sum() == result.merged_count

@@ -11,7 +11,7 @@ from filter_service.rendering.native import NativeRenderer
 from filter_service.view_state import State
 from tests.grid_specs import grid_spec
 from tests.numerical.scene_frames import SCENES, scene_view
-from tests.numerical.synthetic import psnr_db
+from tests.numerical.synthetic import AS_DYNAMIC, psnr_db
 from tests.reference import render_passes as reference
 
 SIZE = {"width_px": 320, "height_px": 180}
@@ -65,7 +65,9 @@ def test_passes_agree_with_the_sorted_gather(engine, often, eye, scene, accumula
     single = renderer.render(
         view, handle, **STATE, accumulation=accumulation, merge=False
     )
-    merged = renderer.render(view, handle, **STATE, accumulation=accumulation)
+    merged = renderer.render(
+        view, handle, **STATE, accumulation=accumulation, render_tolerance=AS_DYNAMIC
+    )
     assert psnr_db(single.color[::ROW_STEP], truth) >= 50.0
     assert psnr_db(merged.color[::ROW_STEP], truth) >= 45.0
     if (eye, scene) in MERGING:

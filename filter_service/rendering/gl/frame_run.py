@@ -26,7 +26,6 @@ from filter_service.gl.stage_timer import StageTimer
 from filter_service.psfs.frame_layers import FrameLayers
 from filter_service.rendering.engine import ViewRequest
 from filter_service.rendering.frame import (
-    Merging,
     border_px_of,
     drop_empty_layer,
     extended,
@@ -384,7 +383,7 @@ class FrameRun:
     def passes_of(self, plan: _Plan, rows: Rows) -> FramePasses:
         """Return the passes of a strip."""
         request, image = self._request, plan.state.image
-        merging = Merging.of(request.options, request.state.gaze_deg)
+        merging = request.merging
         strip = Strip(
             self._gpu,
             rows.view,

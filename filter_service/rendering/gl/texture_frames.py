@@ -34,7 +34,6 @@ from filter_service.gl.stage_timer import Untimed
 from filter_service.gl.texture_io import TextureIo
 from filter_service.psfs.frame_layers import FrameLayers
 from filter_service.rendering.engine import ViewRequest
-from filter_service.rendering.frame import Merging
 from filter_service.rendering.gl.fragment_passes import FragmentPasses
 from filter_service.rendering.gl.frame_run import EyeState
 from filter_service.rendering.gl.kernel_passes import FrameState, KernelRun
@@ -313,7 +312,7 @@ class TextureFrames:
             *(view.width_px, view.height_px, view.tangents, view.projection),
             *(view.is_top_first, view.white_ratio),
             *(target.format == "rgba16f", request.options),
-            Merging.of(request.options, request.state.gaze_deg),
+            request.merging,
             *(image.cell_px, image.grid, kernels.capacity, kernels.group_counts),
             *(gpu.buffers[name].size for name in LISTS if name in gpu.buffers),
             is_counted,
@@ -330,7 +329,7 @@ class TextureFrames:
         """Dispatch the passes of a frame, and record them."""
         request, view, target = given
         gpu = self._gpu
-        merging = Merging.of(request.options, request.state.gaze_deg)
+        merging = request.merging
         state = kernels.state
         strip = Strip(
             gpu,

@@ -27,7 +27,6 @@ from filter_service.rendering.engine import (
     with_exact_psfs,
 )
 from filter_service.rendering.frame import (
-    Merging,
     border_px_of,
     drop_empty_layer,
     extended,
@@ -239,7 +238,7 @@ class NativeRenderer(OneView):
             if white is None:
                 white = white_level(view.color)
             frame.set_merging(
-                Merging.of(request.options, request.state.gaze_deg),
+                request.merging,
                 white_level=white,
                 is_encoded=request.output == "srgb8",
             )
