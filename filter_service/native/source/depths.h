@@ -63,7 +63,7 @@ INLINE void add_coarse(depth_group *group, int r) {
     raster *fine = group->sizes;
     coarse_row row;
     /* Pixel y lies between the coarse rows (y + 0.5) / 2^r + 0.5, rounded down, and the next. */
-    int top = larger_int((coarse->top - 2) << r, 0);
+    int top = larger_int((coarse->top - 2) * (1 << r), 0);
     int bottom = smaller_int((coarse->bottom + 1) << r, fine->height);
     light_rows(fine, top, bottom);
     for (int y = top; y < bottom; ++y) {
