@@ -5,6 +5,7 @@ from .errors import FilterError as FilterError
 from .filter_protocol import Filter as Filter
 from .filter_protocol import FilteredImages as FilteredImages
 from .filtering.eye_filter import EyeFilter as EyeFilter
+from .filtering.operator import FilterOperator as FilterOperator
 from .filtering.planned_frame import Filtered as Filtered
 from .filtering.planned_frame import plan_views as plan_views
 from .filtering.stream_eyes import BuildingEye as BuildingEye

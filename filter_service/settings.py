@@ -79,12 +79,18 @@ class RenderOptions(Record):
     peripheral_merging : bool
         Whether pixels merge more where a viewer detects less contrast, by the angle
         from the frame's gaze; faster.  Frames without a gaze are not affected.
+    bright_pixels : bool
+        Whether pixels that are much brighter than white, or than what surrounds them,
+        are treated as light sources: with their light beyond the kernels, and without
+        amplification where coverage is missing.  With this and ``merge`` off, the image
+        is a linear function of linear light, as in `EyeFilter.operator`.
     """
 
     accumulation: Accumulation = "coverage"
     merge: bool = True
     render_tolerance: RenderTolerance = 1.0
     peripheral_merging: bool = False
+    bright_pixels: bool = True
 
 
 class RenderOptionValues(TypedDict, total=False):
@@ -94,6 +100,7 @@ class RenderOptionValues(TypedDict, total=False):
     merge: bool
     render_tolerance: float
     peripheral_merging: bool
+    bright_pixels: bool
 
 
 DEFAULT_OPTIONS = RenderOptions()

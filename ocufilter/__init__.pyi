@@ -74,6 +74,7 @@ from filter_service import Filter as Filter
 from filter_service import Filtered as Filtered
 from filter_service import FilteredImages as FilteredImages
 from filter_service import FilterError as FilterError
+from filter_service import FilterOperator as FilterOperator
 from filter_service import FilterSettings as FilterSettings
 from filter_service import GlTexture as GlTexture
 from filter_service import Output as Output

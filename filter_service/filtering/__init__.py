@@ -6,6 +6,7 @@ replaces the previous one.  A *store* is the PSF cache of one eye for one camera
 *builder* advances the builds of all streams of a process.
 
 eye_filter        `EyeFilter`: one stream
+operator          `FilterOperator`: the filter of a frame as a matrix
 planned_frame     a frame whose eyes are prepared, and `Filtered`
 stream_eyes       the profiles of a stream, their stores and events
 frame_history     the last frames of a stream, which predict the next ones

@@ -13,13 +13,11 @@ import math
 import os
 import time
 from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Self, Unpack
 
+import numpy as np
 from numpy.typing import NDArray
 
-from estimator.profiles.files import load_profile
-from estimator.profiles.parse import EyeProfile, parse_profile
 from filter_service.camera import Camera
 from filter_service.errors import (
     BadMessage,
@@ -28,6 +26,11 @@ from filter_service.errors import (
 )
 from filter_service.filter_protocol import Filter
 from filter_service.filtering.builder import Builder
+from filter_service.filtering.operator import (
+    FilterOperator,
+    operator_options,
+    views_of_depth,
+)
 from filter_service.filtering.planned_frame import Filtered, PlannedFrame, PlannedView
 from filter_service.filtering.shared_builder import SharedBuilder, acquired
 from filter_service.filtering.stream_eyes import (
@@ -38,7 +41,9 @@ from filter_service.filtering.stream_eyes import (
     EyeReady,
     PreparedStore,
     Preparing,
+    Profile,
     StreamEyes,
+    as_profile,
 )
 from filter_service.rgbd_view import ColorImage, RgbdView, as_cameras, as_views
 from filter_service.settings import (
@@ -56,24 +61,6 @@ from filter_service.view_state import EyeName, State
 from filter_service.waiting import Wait
 
 WAIT_SLICE_S = 0.02
-
-Profile = EyeProfile | Mapping[str, Any] | str | Path
-
-
-def as_profile(profile: Profile) -> EyeProfile:
-    """Return a parsed profile, given as one, as a mapping, a preset's name or a file.
-
-    Raises
-    ------
-    ValueError
-        If the profile is invalid; the message names the field, the value and the
-        allowed values.
-    """
-    if isinstance(profile, Mapping):
-        return parse_profile(profile)
-    if isinstance(profile, str | Path):
-        return load_profile(str(profile))
-    return profile
 
 
 class EyeFilter:
@@ -376,6 +363,44 @@ class EyeFilter:
                 if seen:
                     return seen
                 self._wait_for_worker(waiting, "the eye to be prepared for this camera")
+
+    def operator(
+        self,
+        depth_m: NDArray[Any] | RgbdView | Sequence[RgbdView],
+        *,
+        pupil_diameter_mm: float,
+        focus_dpt: float,
+        gaze_deg: tuple[float, float] | None = None,
+        render_tolerance: float = 1.0,
+        timeout_s: float = 120.0,
+    ) -> FilterOperator:
+        """Return the filter of one frame as a linear operator; compute its PSFs first.
+
+        It computes what `filter` computes with ``merge=False, bright_pixels=False,
+        output="linear"``, and the adjoint.  It uses the native engine, whatever the
+        filter's engine is.
+
+        Parameters
+        ----------
+        depth_m : (height, width) float32, RgbdView, or sequence of RgbdView
+            Depth as for `filter`, or views, whose colors are ignored.
+        pupil_diameter_mm, focus_dpt, gaze_deg, render_tolerance, timeout_s
+            As for `filter`.
+
+        Raises
+        ------
+        BadMessage
+            In addition to the errors of `filter`: the pipeline is "published", or views
+            have different shapes.
+        """
+        views = views_of_depth(depth_m, next(iter(self.cameras), None))
+        states = [State.checked(pupil_diameter_mm, focus_dpt, gaze_deg)] * len(views)
+        options = operator_options(render_tolerance)
+        is_sequence = not isinstance(depth_m, RgbdView | np.ndarray)
+        with self._new_wait("Preparing the operator", timeout_s) as waiting:
+            while not (planned := self.plan(views, states, newest_only=True)):
+                self._wait_for_worker(waiting, "the eye to be prepared for this camera")
+        return FilterOperator.of(planned, options, is_sequence=is_sequence)
 
     def try_filter(
         self,

@@ -101,6 +101,7 @@ class Frame(c.Structure):
         ("tolerance", c.c_float),
         ("gaze_direction", c.c_float * 3),
         ("largest_reach_px", c.c_float),
+        ("bright_pixels", c.c_int32),
         ("fragments", POINTER),
         ("lights", POINTER),
         ("extras", POINTER),

@@ -282,11 +282,15 @@ class Merging(NamedTuple):
     gaze : GazeDirection
     paper_rule : bool
         Whether light of several distances is combined as in the paper.
+    bright_pixels : bool
+        Whether coverage does not amplify pixels that are much brighter than what
+        surrounds them.
     """
 
     tolerance: float
     gaze: GazeDirection
     paper_rule: bool
+    bright_pixels: bool
 
     @classmethod
     def of(
@@ -304,6 +308,7 @@ class Merging(NamedTuple):
             tolerance if options.merge else 0.0,
             merge_gaze(options, gaze_deg),
             options.accumulation == "paper",
+            options.bright_pixels,
         )
 
 

@@ -20,7 +20,7 @@ image, its edge is repeated.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -89,25 +89,46 @@ def spectacle_magnification(profile: EyeProfile) -> Matrix | None:
     return (a, b), (c, d)
 
 
-def seen_through(view: RgbdView, magnification: Matrix) -> RgbdView:
-    """Return the view as seen through spectacles, in linear light."""
-    left, right, up, down = view.tangents
-    steps = (right - left) / view.width_px, (down - up) / view.height_px
-    frame = np.array([left, up, *steps])
-    to_source = np.linalg.inv(np.array(magnification))
-    images: dict[str, Any] = {}
-    for color, depth in (("color", "depth_m"), ("hidden_color", "hidden_depth_m")):
-        light, meters = getattr(view, color), getattr(view, depth)
-        if light is None:
-            continue
-        light, meters = map(np.ascontiguousarray, (_linear(light), meters))
+class Spectacles:
+    """Spectacles of a magnification before a camera, which resample its images."""
+
+    def __init__(self, magnification: Matrix, camera: Camera):
+        left, right, up, down = camera.tangents
+        steps = (right - left) / camera.width_px, (down - up) / camera.height_px
+        self._frame = np.array([left, up, *steps])
+        self._to_source = np.linalg.inv(np.array(magnification))
+
+    def resample(
+        self, color: NDArray[Any], depth_m: NDArray[np.float32]
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Return color (height, width, 3), in linear light, and depth as seen."""
+        light, meters = map(np.ascontiguousarray, (_linear(color), depth_m))
         resampled, resampled_m = np.empty_like(light), np.empty_like(meters)
         loops().call(
             "resample",
-            *(shared_threads(), light, meters, *meters.shape, frame, to_source),
-            *(resampled, resampled_m),
+            *(shared_threads(), light, meters, *meters.shape),
+            *(self._frame, self._to_source, resampled, resampled_m),
         )
-        images |= {color: resampled, depth: resampled_m}
+        return resampled, resampled_m
+
+    def adjoint(self, resampled: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return the adjoint of the resampling of color (height, width, 3)."""
+        color = np.empty_like(resampled)
+        loops().call(
+            "resample_adjoint",
+            *(resampled, *resampled.shape[:2], self._frame, self._to_source, color),
+        )
+        return color
+
+
+def seen_through(view: RgbdView, magnification: Matrix) -> RgbdView:
+    """Return the view as seen through spectacles, in linear light."""
+    spectacles = Spectacles(magnification, view.camera)
+    color, depth_m = spectacles.resample(view.color, view.depth_m)
+    images: dict[str, Any] = {"color": color, "depth_m": depth_m}
+    if view.hidden_color is not None and view.hidden_depth_m is not None:
+        hidden = spectacles.resample(view.hidden_color, view.hidden_depth_m)
+        images |= dict(zip(("hidden_color", "hidden_depth_m"), hidden, strict=True))
     return replace(view, **images)
 
 
@@ -158,6 +179,21 @@ def add_haze(
     )
 
 
+def haze_adjoint(
+    image: NDArray[np.float32],
+    camera: Camera,
+    straylight: Straylight,
+    gain_ratio: tuple[float, float, float] = (1.0, 1.0, 1.0),
+) -> NDArray[np.float32]:
+    """Return the adjoint of `add_haze` for an image (height, width, 3)."""
+    grid = haze_grid(camera, straylight)
+    light = image * np.array(gain_ratio, np.float32)
+    means = grid.scatter_adjoint(grid.interpolation_adjoint(light))
+    light *= np.float32(1.0 - grid.fraction)
+    light += grid.means_adjoint(means)
+    return light
+
+
 class HazeGrid:
     """Convolution of a camera's image with the scatter function of an eye.
 
@@ -190,14 +226,46 @@ class HazeGrid:
         beyond = self._outside * _edge_light(coarse)
         return (self._spread(coarse) + beyond).astype(np.float32, order="C")
 
-    def _spread(self, coarse: NDArray[Any]) -> NDArray[Any]:
+    def scatter_adjoint(self, light: NDArray[Any]) -> NDArray[np.float32]:
+        """Return the adjoint of `scatter` for light (n, m, 3)."""
+        found = self._spread(light, is_adjoint=True)
+        n, m = self.shape
+        beyond = (self._outside * light).sum(axis=(0, 1)) / (2 * (n + m))
+        for edge in (found[0], found[-1], found[:, 0], found[:, -1]):
+            edge += beyond
+        return found.astype(np.float32)
+
+    def interpolation_adjoint(self, light: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return the adjoint (n, m, 3) of the interpolation to pixels."""
+        rows, columns = self.rows.interpolation.T, self.columns.interpolation.T
+        return _along_both(rows, columns, light)
+
+    def means_adjoint(self, coarse: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return the adjoint (height, width, 3) of the means over cells (n, m, 3)."""
+        return _along_both(self.rows.means.T, self.columns.means.T, coarse)
+
+    def _spread(
+        self, coarse: NDArray[Any], *, is_adjoint: bool = False
+    ) -> NDArray[Any]:
         from scipy import fft
 
         n, m = coarse.shape[:2]
         spectrum = fft.rfft2(coarse, self._padded, axes=(0, 1), workers=thread_count())
-        spectrum *= self._spectrum[..., None]
+        factor = np.conj(self._spectrum) if is_adjoint else self._spectrum
+        spectrum *= factor[..., None]
         found = fft.irfft2(spectrum, self._padded, axes=(0, 1), workers=thread_count())
         return found[:n, :m]
+
+
+def _along_both(
+    rows: Any, columns: Any, image: NDArray[np.float32]
+) -> NDArray[np.float32]:
+    """Return an image (n, m, 3) with sparse matrices applied along both axes."""
+    n, m = columns.shape[0], image.shape[1]
+    across = np.swapaxes(image, 0, 1).reshape(m, -1)
+    found = (columns @ across).reshape(n, image.shape[0], RGB)
+    along = np.swapaxes(found, 0, 1).reshape(image.shape[0], -1)
+    return np.ascontiguousarray((rows @ along).reshape(-1, n, RGB))
 
 
 @lru_cache(maxsize=8)
@@ -230,6 +298,33 @@ class _Axis:
     def count(self) -> int:
         """Return the number of cells."""
         return self.first_px.size
+
+    @cached_property
+    def means(self) -> Any:
+        """Sparse matrix (n, n_px) of the means over cells."""
+        from scipy.sparse import csr_array
+
+        n, k = self.shares.shape
+        rows = np.repeat(np.arange(n), k)
+        columns = (self.first_px[:, None] + np.arange(k)).ravel()
+        is_inside = columns < self.position.size
+        kept = self.shares.ravel()[is_inside].astype(np.float32)
+        shape = n, self.position.size
+        return csr_array((kept, (rows[is_inside], columns[is_inside])), shape=shape)
+
+    @cached_property
+    def interpolation(self) -> Any:
+        """Sparse matrix (n_px, n) of the interpolation between cells."""
+        from scipy.sparse import csr_array
+
+        n_px, last = self.position.size, self.count - 1
+        first = np.minimum(self.position.astype(np.int64), max(last - 1, 0))
+        share = self.position - first
+        columns = np.stack([first, np.minimum(first + 1, last)], axis=1)
+        values = np.stack([1.0 - share, share], axis=1).astype(np.float32)
+        rows = np.repeat(np.arange(n_px), 2)
+        index = rows, columns.ravel()
+        return csr_array((values.ravel(), index), shape=(n_px, self.count))
 
     @classmethod
     def of(cls, first: float, last: float, n_px: int) -> _Axis:
@@ -342,12 +437,18 @@ class MediaEffects:
                     allowed="none for frames in textures; filter frames of arrays",
                 )
 
-    def apply(self, color: NDArray[np.float32], view: RgbdView) -> None:
-        """Apply the media to linear light (height, width, 3) of a view, in place."""
+    def apply(self, color: NDArray[np.float32], camera: Camera) -> None:
+        """Apply the media to linear light (height, width, 3), in place."""
         if self.straylight is not None:
-            add_haze(color, view.camera, self.straylight, self.gain_ratio)
+            add_haze(color, camera, self.straylight, self.gain_ratio)
         elif self.gain_ratio != UNCHANGED:
             color *= np.array(self.gain_ratio, np.float32)
+
+    def adjoint(self, image: NDArray[np.float32], camera: Camera) -> NDArray[Any]:
+        """Return the adjoint of `apply` for an image (height, width, 3)."""
+        if self.straylight is not None:
+            return haze_adjoint(image, camera, self.straylight, self.gain_ratio)
+        return image * np.array(self.gain_ratio, np.float32)
 
 
 def begin_through_media(
@@ -388,7 +489,7 @@ def _begin(
         request = replace(request, view=view)
     request = with_exact_psfs(engine, request)
     edge_light: EdgeLight | MissingPsfs | None = None
-    if view.color.dtype != np.uint8:
+    if view.color.dtype != np.uint8 and request.options.bright_pixels:
         request = replace(request, white_level=white_level(view.color))
         edge_light = EdgeLight.of(request, view)
     if isinstance(edge_light, MissingPsfs):
@@ -414,7 +515,7 @@ def _begin(
                     coarse = NOTHING
         with times.wall("edge_light_ms" if effects is None else "media_ms"):
             if effects is not None:
-                effects.apply(color, view)
+                effects.apply(color, view.camera)
             color = encoded(color, request.output, coarse)
         return replace(rendered, color=color)
 

@@ -44,6 +44,7 @@ uniform int max_level;            // 0: no merging
 uniform ivec2 scan_px;            // index of the first pixel, pixels of the whole frame
 uniform int paper_order;          // sort as in the paper: meters plus scan position
 uniform int surface;              // 0: visible, 1: hidden
+uniform int bright_pixels;        // 0: no light is in excess
 
 float gain = 1.0;                 // of the block's limits, away from the gaze
 
@@ -323,7 +324,8 @@ Fragment make_fragment(ivec2 at, vec4 value, float place, int level, float edge,
     }
     float fraction = clamp(place - float(interval), 0.0, 1.0);
     uint kernel = kernel_in(at, interval);
-    vec3 excess = max(value.rgb - usual_light * (surface == 0 ? 1.0 : edge), 0.0);
+    vec3 excess = bright_pixels == 0 ? vec3(0.0)
+        : max(value.rgb - usual_light * (surface == 0 ? 1.0 : edge), 0.0);
     return Fragment(value.rgb, sort_depth(at, value.a), at, kernel, fraction,
                     kernel_radius_px(kernel), kernel_reach(kernel), level,
                     vec2(edge, dot(excess, vec3(1.0 / float(RGB)))));

@@ -1,5 +1,6 @@
 /* The pixels of a block: light, distance, position between layers, kernel. */
 
+#include <float.h>
 #include <math.h>
 
 #include "color.h"
@@ -221,6 +222,10 @@ static void sum_block_row(void *argument, int row, int thread) {
  * those around it. */
 INLINE void set_bright(block *b, int column, int row) {
     const frame *f = b->f;
+    if (!f->bright_pixels) {
+        b->bright = all4(FLT_MAX);
+        return;
+    }
     f32x4 sum = all4(0.0f);
     int right = smaller_int(column + 2, f->block_columns);
     int bottom = smaller_int(row + 2, f->block_rows);

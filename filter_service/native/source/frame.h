@@ -162,6 +162,7 @@ typedef struct {
     float tolerance;          /* of merging, relative to the default */
     float gaze_direction[3];  /* right, up, forward; zero: merging is the same everywhere */
     float largest_reach_px;
+    int32_t bright_pixels;    /* 0: no light is in excess */
     fragment *fragments;      /* block_slots per block; no gaps in a row of blocks */
     fragment_light *lights;
     fragment_extra *extras;

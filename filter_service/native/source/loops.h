@@ -18,6 +18,7 @@
 #include "depths.h"
 #include "picture.h"
 #include "splat.h"
+#include "operator.h"
 #include "shrink.h"
 #include "kernel_plan.h"
 #include "haze.h"
@@ -83,6 +84,10 @@ static const named_function functions[] = {
     FUNCTION(place),
     FUNCTION(blend),
     FUNCTION(splat),
+    FUNCTION(new_operator),
+    FUNCTION(end_operator),
+    FUNCTION(apply_operator),
+    FUNCTION(apply_adjoint),
     FUNCTION(shrink),
     FUNCTION(map_ratios),
     FUNCTION(list_kernels),
@@ -92,6 +97,7 @@ static const named_function functions[] = {
     FUNCTION(cell_means),
     FUNCTION(add_scattered),
     FUNCTION(resample),
+    FUNCTION(resample_adjoint),
     FUNCTION(needed_intervals),
     FUNCTION(spread_nodes),
     FUNCTION(node_blur),

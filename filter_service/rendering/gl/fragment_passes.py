@@ -164,6 +164,7 @@ class FragmentPasses:
                     tolerance=self.merging.tolerance,
                     tangents=self.strip.view.tangents,
                     gaze_direction=self.merging.gaze,
+                    bright_pixels=int(self.merging.bright_pixels),
                     paper_order=int(self.strip.paper_rule),
                     scan_px=self.scan,
                     surface=surface,

@@ -1,1 +1,2 @@
+from .renderer import FrameOperator as FrameOperator
 from .renderer import NativeRenderer as NativeRenderer

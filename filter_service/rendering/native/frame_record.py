@@ -479,15 +479,16 @@ class FrameRecord:
         self, merging: Merging, *, white_level: float, is_encoded: bool
     ) -> None:
         """Set how the frame is merged; the paper has one level."""
-        c, (tolerance, gaze, paper_rule) = self.c, merging
+        c, tolerance, paper_rule = self.c, merging.tolerance, merging.paper_rule
         c.paper_rule, c.white_level = paper_rule, white_level
+        c.bright_pixels = merging.bright_pixels
         c.is_encoded = is_encoded and white_level > 0.0
         most = 1 if paper_rule else MAX_LEVEL
         if c.cell_px:
             most = min(most, c.cell_px.bit_length() - 1)
         c.max_level = most if tolerance > 0.0 else 0
         c.tolerance = tolerance
-        c.gaze_direction[:] = gaze
+        c.gaze_direction[:] = merging.gaze
         for r in range(1, RESOLUTIONS):
             spread_px = COARSE_SPREAD_PX[r] / tolerance if tolerance > 0.0 else math.inf
             c.coarse_spread_px[r] = max(spread_px, COARSE_SPREAD_PX[r])

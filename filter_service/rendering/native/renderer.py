@@ -6,12 +6,14 @@ import weakref
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from estimator.native import core
 from estimator.threads import thread_count
+from filter_service.constants import RGB
 from filter_service.errors import RenderFailed
 from filter_service.native import Loops, loops
 from filter_service.psfs.frame_layers import FrameLayers
@@ -45,6 +47,7 @@ from filter_service.rendering.native.frame_record import (
 )
 from filter_service.rgbd_view import RgbdView
 from filter_service.stage_times import StageTimes
+from filter_service.view_state import State
 
 MAX_EYES = 4
 """Cache size: the eyes of a stereo frame, and of other clients that stream at the same
@@ -104,6 +107,68 @@ class EyeStates:
     def memory_mb(self) -> float:
         """Memory of all blended kernels, MB."""
         return sum(eye.arrays.memory_mb for eye in self._eyes)
+
+
+class Prepared(NamedTuple):
+    """A view with its fragments and blended kernels."""
+
+    request: ViewRequest
+    frame: FrameRecord
+    plan: KernelPlan
+    sizes: BlendSizes
+    missing_count: int
+    state: State
+    notes: tuple[str, ...]
+
+
+class FrameOperator:
+    """The image of a frame as a linear function of its colors, and its adjoint.
+
+    Not thread-safe.
+
+    Parameters
+    ----------
+    renderer : NativeRenderer
+        Renderer of the frame, whose threads end with it.
+    library : Loops
+    frame : FrameRecord
+        A frame that is prepared, and not merged.
+
+    Attributes
+    ----------
+    color_shape : (surfaces, height, width, 3)
+
+    Raises
+    ------
+    RenderFailed
+        Out of memory.
+    """
+
+    def __init__(self, renderer: NativeRenderer, library: Loops, frame: FrameRecord):
+        self._renderer, self._loops, self._frame = renderer, library, frame
+        c = frame.c
+        self.color_shape = (c.surface_count, c.image_height, c.image_width, RGB)
+        self._plan = library.call("new_operator", c)
+        if not self._plan:
+            raise RenderFailed("out of memory for the lists of an operator")
+        weakref.finalize(self, library.call, "end_operator", self._plan)
+        self._bordered: NDArray[np.float32] | None = None
+        if c.border_px:
+            self._bordered = np.empty((c.surface_count, c.height, c.width, RGB), "f4")
+
+    def forward(self, color: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return the image (height, width, 3) of colors of the operator's shape."""
+        image = np.empty(self.color_shape[1:], np.float32)
+        self._loops.call("apply_operator", self._frame.c, self._plan, color, image)
+        return image
+
+    def adjoint(self, image: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return the adjoint, of the shape of colors, of an image."""
+        color = np.empty(self.color_shape, np.float32)
+        self._loops.call(
+            "apply_adjoint", self._frame.c, self._plan, image, self._bordered, color
+        )
+        return color
 
 
 class NativeRenderer(OneView):
@@ -187,6 +252,29 @@ class NativeRenderer(OneView):
             Out of memory, or the view is in textures; in addition to the errors of
             `FrameEngine.begin`.
         """
+        prepared = self._prepared(request)
+        if isinstance(prepared, MissingPsfs):
+            return lambda: prepared
+        rendered = self._splat(prepared)
+        return lambda: rendered
+
+    def operator(self, request: ViewRequest) -> FrameOperator | MissingPsfs:
+        """Return a view's image as a linear operator of its colors.
+
+        It keeps arrays of this renderer, which must not be used afterward.
+
+        Raises
+        ------
+        RenderFailed
+            Out of memory; in addition to the errors of `begin`.
+        """
+        prepared = self._prepared(request)
+        if isinstance(prepared, MissingPsfs):
+            return prepared
+        return FrameOperator(self, self._loops, prepared.frame)
+
+    def _prepared(self, request: ViewRequest) -> Prepared | MissingPsfs:
+        """Prepare a view: everything but the splat."""
         view = request.view
         gaze_deg, gaze_notes = check_request(request, request.handle.store.spec)
         if not isinstance(view, RgbdView):
@@ -197,31 +285,32 @@ class NativeRenderer(OneView):
         eye = self._eyes.of(handle)
         layers = handle.layers(timer, request.state, request.options)
         fill = partial(self._fill, timer, handle, request.until_s)
+        state = replace(layers.state, gaze_deg=gaze_deg)
+        notes = (*layers.notes, *gaze_notes)
         cell_px = None
         while True:
             image = handle.cells(timer, gaze_deg, cell_px)
             try:
-                rendered = self._render(
-                    request, view, gaze_deg, eye, layers, image, fill
-                )
+                blended = self._blended(request, view, eye, layers, image, fill)
                 break
             except KernelsTooLarge:
                 cell_px = 2 * image.cell_px
-        if isinstance(rendered, ViewResult):
-            notes = (*layers.notes, *gaze_notes, *rendered.notes)
-            rendered = replace(rendered, notes=notes)
-        return lambda: rendered
+        if isinstance(blended, MissingPsfs):
+            return blended
+        frame, plan, sizes, missing_count = blended
+        notes += input_notes(view.depth_m, missing_count, frame.c.bad_color_count)
+        return Prepared(request, frame, plan, sizes, missing_count, state, notes)
 
-    def _render(
+    def _blended(
         self,
         request: ViewRequest,
         view: RgbdView,
-        gaze_deg: tuple[float, float],
         eye: EyeState,
         layers: FrameLayers,
         image: ImageCells,
         fill: Fill,
-    ) -> ViewResult | MissingPsfs:
+    ) -> tuple[FrameRecord, KernelPlan, BlendSizes, int] | MissingPsfs:
+        """Make fragments and kernels; also return the missing depth count."""
         timer = request.times
         frame = FrameRecord.new(
             self._threads, self._n_threads, self._arrays, eye.arrays
@@ -243,7 +332,11 @@ class NativeRenderer(OneView):
                 is_encoded=request.output == "srgb8",
             )
             self._loops.call("merge", frame.c)
-        sizes = self._blend(timer, frame, plan, eye)
+        return frame, plan, self._blend(timer, frame, plan, eye), missing_count
+
+    def _splat(self, prepared: Prepared) -> ViewResult:
+        request, frame, plan = prepared.request, prepared.frame, prepared.plan
+        timer = request.times
         with timer.wall("splat_ms"):
             picture = output_array(request)
             frame.set_picture(picture)
@@ -253,17 +346,17 @@ class NativeRenderer(OneView):
         return ViewResult(
             color=picture,
             stage_times_ms=timer.ms,
-            missing_depth_count=missing_count,
+            missing_depth_count=prepared.missing_count,
             clamped_depth_count=frame.c.clamped_count,
             bad_color_count=frame.c.bad_color_count,
-            state=replace(layers.state, gaze_deg=gaze_deg),
+            state=prepared.state,
             fragment_count=frame.c.fragment_count,
             merged_count=frame.c.merged_count,
             entry_count=frame.c.entry_count,
             kernel_count=plan.kernels.count,
-            kernel_texel_count=sizes.kernel_texels - frame.c.kernel_gap_count,
-            layer_count=len(layers.layer_dpt),
-            notes=input_notes(view.depth_m, missing_count, frame.c.bad_color_count),
+            kernel_texel_count=prepared.sizes.kernel_texels - frame.c.kernel_gap_count,
+            layer_count=frame.c.layer_count,
+            notes=prepared.notes,
         )
 
     def _pixels(
