@@ -40,6 +40,7 @@ Importing this package loads no submodules, which keeps clients light.
     rendering/       the renderer: from a frame and PSFs to the output image
     building/        the build worker, which estimates eyes
     filtering/       `EyeFilter`: streams of frames, in process
+    correcting/      pictures solved for a viewer
     wire/            the types of messages
     service/         front end, render workers and supervisor
 """

@@ -1,5 +1,9 @@
 from .camera import Camera as Camera
 from .camera import tangents_from_fov as tangents_from_fov
+from .correcting.sensitivity import SensitivityWeight as SensitivityWeight
+from .correcting.solver import PictureOperator as PictureOperator
+from .correcting.solver import PictureSolution as PictureSolution
+from .correcting.solver import nearest_picture as nearest_picture
 from .errors import BadMessage as BadMessage
 from .errors import FilterError as FilterError
 from .filter_protocol import Filter as Filter

@@ -78,13 +78,17 @@ from filter_service import FilterOperator as FilterOperator
 from filter_service import FilterSettings as FilterSettings
 from filter_service import GlTexture as GlTexture
 from filter_service import Output as Output
+from filter_service import PictureOperator as PictureOperator
+from filter_service import PictureSolution as PictureSolution
 from filter_service import Preparing as Preparing
 from filter_service import RenderOptions as RenderOptions
 from filter_service import RgbdView as RgbdView
+from filter_service import SensitivityWeight as SensitivityWeight
 from filter_service import TextureView as TextureView
 from filter_service import ViewState as ViewState
 from filter_service import as_views as as_views
 from filter_service import errors as errors
 from filter_service import is_software_renderer as is_software_renderer
+from filter_service import nearest_picture as nearest_picture
 from filter_service import plan_views as plan_views
 from filter_service import tangents_from_fov as tangents_from_fov

@@ -109,6 +109,7 @@ FILTER_ROOMS = {
     "rendering": ("psfs", "planning", "gl", "native"),
     "building": ("psfs", "planning"),
     "filtering": ("building", "rendering", "psfs", "planning", "gl"),
+    "correcting": ("filtering", "rendering"),
     "service": ("filtering", "building", "wire"),
 }
 """A frame's data runs one way; each room knows only those before it."""

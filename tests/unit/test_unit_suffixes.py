@@ -36,6 +36,8 @@ DIMENSIONLESS = {
     "srgb": "encoded light, 0 to 1",
     "background_srgb": "encoded light, 0 to 1",
     "defocus_error": "mean square, of a white of 1",
+    "errors": "mean squares, of a white of 1",
+    "lower_bound": "as errors",
     "render_tolerance": "errors over the usual ones",
     "oversampling": "samples per sample",
     "conic_constant": "shape of a conic, 0 sphere, -1 paraboloid",

@@ -1,0 +1,4 @@
+from .sensitivity import SensitivityWeight as SensitivityWeight
+from .solver import PictureOperator as PictureOperator
+from .solver import PictureSolution as PictureSolution
+from .solver import nearest_picture as nearest_picture
