@@ -36,6 +36,7 @@ from typing import Any
 from filter_service import one_blas_thread  # noqa: F401  (before any numpy)
 from filter_service.building.jobs import Build, BuildJob, BuiltStore, to_build_error
 from filter_service.errors import BuildCancelled
+from filter_service.heap import trim_heap
 from filter_service.log_lines import configure_logging
 
 PROGRESS_INTERVAL_S = 0.1
@@ -46,6 +47,9 @@ MAX_STORES = 4
 URGENT_PARTS, REST_RATIO = 3, 2.0
 """Number of parts near a state that are planned without a rest, and the rests after the
 others relative to their duration, which leave the cores to frames."""
+
+TRIM_AFTER_S = 0.2
+"""Idle time after which freed memory is returned to the system: 20 MB after a build."""
 
 log = logging.getLogger("ocufilter.worker")
 
@@ -83,6 +87,8 @@ def serve_builds(pipe: Connection, build_name: str) -> None:
                 rest_s = REST_RATIO * took_s if n_parts > URGENT_PARTS else 0.0
                 continue
             n_parts, rest_s = 0, 0.0
+            if not requests.has_next(TRIM_AFTER_S):
+                trim_heap()
             kind, ticket, *arguments = requests.next()
             if kind == "build":
                 found = _build_one(requests, build, ticket=ticket, job=arguments[0])

@@ -1,10 +1,13 @@
 """Freed memory goes back to the system."""
 
+import threading
 import time
+from multiprocessing import Pipe
 
 import numpy as np
 
-from filter_service.building.jobs import BuildLimits
+from filter_service.building import worker
+from filter_service.building.jobs import BuildLimits, BuiltStore
 from filter_service.building.worker_handle import InlineWorker
 from filter_service.filtering import builder as builder_module
 from filter_service.filtering.builder import Builder
@@ -42,3 +45,29 @@ def test_the_heap_is_trimmed_once_after_stores_were_dropped(monkeypatch):
     finally:
         builder.close()
     assert trimmed == [1]
+
+
+def _build_nothing(job, *, progress, cancelled):
+    return BuiltStore(job)
+
+
+def test_the_build_worker_trims_its_heap_once_it_is_idle(monkeypatch):
+    trimmed = threading.Event()
+    monkeypatch.setattr(worker, "trim_heap", trimmed.set)
+    monkeypatch.setattr(worker, "TRIM_AFTER_S", 0.01)
+    monkeypatch.setattr(worker, "_import_function", lambda name: _build_nothing)
+    monkeypatch.setattr(worker, "configure_logging", lambda name: None)
+    monkeypatch.setattr(worker.signal, "signal", lambda *handler: None)
+    ours, theirs = Pipe()
+    thread = threading.Thread(target=worker.serve_builds, args=(theirs, ""))
+    thread.start()
+    try:
+        assert ours.recv() == ("ready",)
+        assert trimmed.wait(10.0), "what imports have freed"
+        trimmed.clear()
+        ours.send(("build", 1, None))
+        assert ours.recv()[:2] == ("result", 1)
+        assert trimmed.wait(10.0)
+    finally:
+        ours.close()
+        thread.join()

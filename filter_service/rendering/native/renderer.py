@@ -53,10 +53,6 @@ MAX_EYES = 4
 """Cache size: the eyes of a stereo frame, and of other clients that stream at the same
 time."""
 
-MAX_TAKEN_MB = 150.0
-"""Memory of the arrays that a new eye takes over.  Emmetropia of 1280x720 has 75 MB, a
-cataract 250."""
-
 
 @dataclass(eq=False)
 class EyeState:
@@ -66,13 +62,13 @@ class EyeState:
     ----------
     handle : NativeStore
     arrays : Arrays
-        Arrays of blended kernels.
+        Arrays of blended kernels, 75 MB for emmetropia of 1280x720, 180 for a cataract.
     plan : KernelPlan or None
     blended : (plan, computed levels, sizes) or None
     """
 
     handle: NativeStore
-    arrays: Arrays = field(default_factory=Arrays)
+    arrays: Arrays = field(default_factory=partial(Arrays, is_dense=True))
     plan: KernelPlan | None = None
     blended: tuple[KernelPlan, NDArray[np.uint8], BlendSizes] | None = None
 
@@ -86,20 +82,19 @@ class EyeStates:
     def of(self, handle: NativeStore) -> EyeState:
         """Return the state of an eye, which becomes the most recently used.
 
-        A new eye takes over the arrays of a released one, unless they are large.  In
-        the first frame of a cataract of 1280x720, touching new memory took 0.2 s.
+        A new eye takes over the arrays of a released one.  In the first frame of a
+        cataract of 1280x720, touching new memory took 0.2 s.
         """
         found = next((eye for eye in self._eyes if eye.handle is handle), None)
         others = [
             eye for eye in self._eyes if eye is not found and not eye.handle.is_released
         ]
         if found is None:
-            released = [
-                eye.arrays
-                for eye in self._eyes
-                if eye.handle.is_released and eye.arrays.memory_mb <= MAX_TAKEN_MB
-            ]
-            found = EyeState(handle, arrays=released[-1] if released else Arrays())
+            released = [eye.arrays for eye in self._eyes if eye.handle.is_released]
+            found = EyeState(handle)
+            if released:
+                found.arrays = released[-1]
+                found.arrays.restart()
         self._eyes = [*others[1 - MAX_EYES :], found]
         return found
 
@@ -341,6 +336,7 @@ class NativeRenderer(OneView):
             picture = output_array(request)
             frame.set_picture(picture)
             self._loops.call("splat", frame.c)
+        eye.arrays.end_frame()
         if frame.c.failed:
             raise RenderFailed("out of memory for the fragment lists of a frame")
         return ViewResult(
