@@ -174,6 +174,7 @@ class ServiceLink:
             self.n_superseded += 1
             self._drop(self.pending, "superseded")
         self.pending = outgoing
+        self._send_waiting()  # before messages that may have arrived
         self.pump(0.0)
 
     @property

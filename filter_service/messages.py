@@ -52,6 +52,7 @@ from filter_service.wire.message import (
     Message,
     Part,
     plain_message,
+    plain_request,
     unpack_header,
 )
 from filter_service.wire.replies import (
@@ -264,7 +265,11 @@ def decode_request(
     """
     limits = limits or Limits()
     try:
-        message = _decoded(parts, REQUESTS, limits)
+        found = plain_request(parts[0], REQUESTS, PROTOCOL_VERSION) if parts else None
+        if found is not None:
+            message = found.with_parts(parts[1:], limits)
+        else:
+            message = _decoded(parts, REQUESTS, limits)
         if unpacks_profiles and isinstance(message, ProfileRequest):
             return message.unpacked()
         return message

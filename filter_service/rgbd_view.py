@@ -148,6 +148,8 @@ class RgbdView:
 
 def _check_plain(field: str, image: object, allowed: str) -> None:
     """Reject values other than arrays, and masked arrays, whose mask would be lost."""
+    if type(image) is np.ndarray:
+        return
     if isinstance(image, np.ma.MaskedArray):
         raise BadMessage(
             f"it is a masked array with {np.asarray(image.mask).sum()} masked values",

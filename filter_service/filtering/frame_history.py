@@ -32,8 +32,8 @@ class FrameHistory:
         at_s: float,
     ) -> None:
         """Add a frame that arrived at ``at_s``."""
-        seen = tuple(SampledView.of(view) for view in views)
-        self.record_sampled(lambda: seen, state, at_s=at_s)
+        seen = [SampledView.later(view) for view in views]
+        self.record_sampled(lambda: tuple(one() for one in seen), state, at_s=at_s)
 
     def record_sampled(
         self,

@@ -6,6 +6,7 @@ Messages are pickled, which is safe because both processes belong to the service
 
 from __future__ import annotations
 
+import array
 import ctypes
 import os
 import pickle
@@ -43,7 +44,8 @@ class WorkerMemory(NamedTuple):
 
 HEAD = struct.Struct("<QB")  # length of the message, number of descriptors
 MAX_DESCRIPTORS = 8
-READ_BYTES = 1 << 18
+CONTROL_BYTES = socket.CMSG_LEN(MAX_DESCRIPTORS * array.array("i").itemsize)
+READ_BYTES = 1 << 16
 
 
 class LinkClosed(Exception):
@@ -63,6 +65,7 @@ class Link:
         end.setblocking(False)
         self._socket = end
         self._unsent: deque[tuple[memoryview, list[int]]] = deque()
+        self._buffer = memoryview(bytearray(READ_BYTES))
         self._received = bytearray()
         self._descriptors: deque[int] = deque()
 
@@ -159,19 +162,20 @@ class Link:
         """Read available data; return whether the other end closed the connection."""
         while True:
             try:
-                data, descriptors, _, _ = socket.recv_fds(
-                    self._socket, READ_BYTES, MAX_DESCRIPTORS
+                count, control, _, _ = self._socket.recvmsg_into(
+                    [self._buffer], CONTROL_BYTES
                 )
             except BlockingIOError:
                 return False
             except OSError:
                 return True
-            self._descriptors += descriptors
-            if not data:
+            for *_, data in control:
+                self._descriptors.extend(array.array("i", data))
+            if not count:
                 return True
-            self._received += data
+            self._received += self._buffer[:count]
             # A read also ends after descriptors; otherwise there was no more data.
-            if len(data) < READ_BYTES and not descriptors:
+            if count < READ_BYTES and not control:
                 return False
 
     def _pop_messages(self) -> list[tuple[Any, list[int]]]:

@@ -364,7 +364,8 @@ class RenderClient:
         )
         arrays = [array for images in frame.images for array in images.arrays]
         sizes_bytes = [array.nbytes for array in arrays]
-        self.send("frame", number, session.key, waiting.header, places, sizes_bytes)
+        own = None if places is frame.memory else places  # the header has the others
+        self.send("frame", number, session.key, waiting.header, own, sizes_bytes)
 
     def _copy_images(self, frame: Frame) -> tuple[SharedPlaces, tuple[Slot, ...]]:
         """Copy the images of a frame to slots of the pool."""

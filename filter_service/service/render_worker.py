@@ -13,7 +13,8 @@ Messages from the front end:
   session's eyes; ``("close", key)``
 - ``("profile", key, request)``
 - ``("frame", number, key, header, places, sizes)``, where ``header`` was received from
-  the client, and ``sizes`` refer to compressed parts
+  the client, ``places`` are those of the header if None, and ``sizes`` refer to
+  compressed parts
 
 Messages to the front end:
 
@@ -445,6 +446,7 @@ class RenderWorker:
                 found = self._textures.get(key, {})
                 textures = {n: imported.texture for n, imported in found.items()}
                 return filter_in_textures(session.filter_of, frame, textures), []
+            places = places or frame.memory
             assert places is not None
             # References, because the front end may drop the slots during the frame.
             slots = self._slots[places.slot], self._slots[places.result_slot]

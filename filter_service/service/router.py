@@ -12,7 +12,7 @@ import struct
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +34,7 @@ ZAP_VERSION = b"1.0"
 ZAP_DOMAIN = b"ocufilter"
 MAX_REQUESTS_PER_TURN = 64
 READABLE = int(zmq.POLLIN)
+SOURCE_DESCRIPTOR = int(zmq.SRCFD)
 NO_WAIT, NO_WAIT_MORE = int(zmq.NOBLOCK), int(zmq.NOBLOCK | zmq.SNDMORE)
 """Flags as integers: operations on pyzmq's enumerations take 1 to 5 us each."""
 
@@ -126,6 +127,12 @@ def parse_user_id(user_id: str) -> tuple[int, str]:
     """Return a connection's number and key, parsed from its ``User-Id``."""
     number, _, key = user_id.partition(" ")
     return int(number), key
+
+
+@lru_cache(maxsize=256)
+def _peer_of(routing_id: bytes, user_id: str) -> Peer:
+    """Return the sender of messages; a stream's messages have the same one."""
+    return Peer(routing_id, *parse_user_id(user_id))
 
 
 FILE = "_drop_parts.so"
@@ -429,18 +436,18 @@ class Router:
         if not has_message(self._socket):
             return None
         frame = self._socket.recv(zmq.NOBLOCK, copy=False)
-        routing_id, (number, key) = frame.bytes, parse_user_id(str(frame["User-Id"]))
-        descriptor = int(frame.get(zmq.SRCFD))
-        connection = self._connections.find(number, descriptor)
-        received = Received(Peer(routing_id, number, key), connection, [])
+        peer = _peer_of(frame.bytes, str(frame["User-Id"]))
+        descriptor = int(frame.get(SOURCE_DESCRIPTOR))
+        connection = self._connections.find(peer.connection, descriptor)
+        received = Received(peer, connection, [])
         parts = received.parts
         while frame.more and len(parts) < self._max_parts:
             frame = self._socket.recv(copy=False)
             parts.append(frame.buffer)
         if frame.more:
             return self._drop_surplus(received)
-        if not self._authenticator.accepts(key):
-            raise KeyRemoved(received.peer)
+        if not self._authenticator.accepts(peer.key):
+            raise KeyRemoved(peer)
         return received
 
     def _drop_surplus(self, received: Received) -> Received | None:

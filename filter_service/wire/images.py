@@ -23,9 +23,12 @@ Compression = Literal["none", "lz4"]
 COMPRESSIONS: tuple[str, ...] = get_args(Compression)
 
 
+BYTES_OF_DTYPE = {"uint8": 1, "uint16": 2, "float16": 2, "float32": 4}
+
+
 def image_bytes(shape: Sequence[int], dtype: str) -> int:
     """Return the size of an image in bytes."""
-    return math.prod(shape) * np.dtype(dtype).itemsize
+    return math.prod(shape) * BYTES_OF_DTYPE[dtype]
 
 
 def largest_block_bytes(size_bytes: int) -> int:
@@ -178,7 +181,7 @@ class ImageFormat(Record):
     @property
     def bytes_per_pixel(self) -> int:
         """Return the size of one RGB pixel."""
-        return 3 * np.dtype(self.dtype).itemsize
+        return 3 * BYTES_OF_DTYPE[self.dtype]
 
 
 SRGB8 = ImageFormat("uint8", "srgb")

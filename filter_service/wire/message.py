@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from functools import cache
 from typing import Annotated, Any, ClassVar, Self
 
 import msgpack
-from msgspec import Meta, MsgspecError, Struct
+from msgspec import Meta, MsgspecError, Struct, convert
 from msgspec import msgpack as msgspec_msgpack
 
 from filter_service.errors import BadMessage
@@ -440,6 +440,44 @@ def plain_message(
     except MsgspecError:
         return None
     return None if getattr(found, found.payload, ()) else found
+
+
+_unpack_any = msgspec_msgpack.Decoder().decode
+_pack_any = msgspec_msgpack.Encoder().encode
+
+
+@cache
+def _names_of(kind: type[Message]) -> frozenset[str]:
+    """Return the keys of a header of a kind of message."""
+    names = {field.name for field in fields(kind)} - {kind.payload}
+    return frozenset(names | {"type", "version"})
+
+
+def plain_request(
+    data: Part, kinds: Mapping[str, type[Message]], version: int
+) -> Message | None:
+    """Return the message of a client's header, without its parts.
+
+    This takes a third of the time of `unpack_header` and `Message.parse`, in a service
+    that was idle, because it runs less code.  Returns None for a header that those have
+    to examine: data that equals the packed value of its map has no repeated keys.
+    """
+    if memoryview(data).nbytes > MAX_HEADER_BYTES:
+        return None
+    try:
+        header = _unpack_any(data)
+        if type(header) is not dict or _pack_any(header) != data:
+            return None
+        name = header.get("type")
+        kind: Any = kinds.get(name) if type(name) is str else None
+        if kind is None or header.keys() - _names_of(kind):
+            return None
+        if type(header["version"]) is not int or header["version"] != version:
+            return None
+        found: Message = convert(header, kind)
+    except (MsgspecError, KeyError, TypeError, ValueError, RecursionError):
+        return None
+    return found
 
 
 def expect_parts(parts: Sequence[Part], count: int) -> None:

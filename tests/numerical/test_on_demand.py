@@ -383,7 +383,7 @@ def test_what_is_computed_ahead_is_what_the_frame_needs(streamed, views):
         state = {k: state[k] for k in ("pupil_diameter_mm", "focus_dpt")}
         store, renderer = PsfStore(*streamed), NativeRenderer()
         handle = renderer.load(store)
-        seen = (SampledView.of(view),)
+        seen = (SampledView.later(view)(),)
         use = SampledFrame(0.0, State(**state), lambda seen=seen: seen)
         ahead = handle.missing_psfs(use)
         store.fill(ahead)
@@ -394,7 +394,7 @@ def test_what_is_computed_ahead_is_what_the_frame_needs(streamed, views):
 
 def sampled(view, *, at_s=0.0, **state):
     state = State(state["pupil_diameter_mm"], state["focus_dpt"])
-    seen = (SampledView.of(view),)
+    seen = (SampledView.later(view)(),)
     return SampledFrame(at_s, state, lambda: seen)
 
 

@@ -24,7 +24,7 @@ from filter_service.messages import (
 )
 from filter_service.service.frame_reply import images_in
 from filter_service.shared_memory import Slot, aligned_starts
-from filter_service.wire.message import plain_message
+from filter_service.wire.message import plain_message, plain_request
 from filter_service.wire.requests import frame_of
 from tests.unit.message_parts import (
     CAMERA,
@@ -57,6 +57,42 @@ def test_a_plain_reply_is_read_as_one_that_is_examined(message, monkeypatch):
     plain = decode_reply(parts)
     monkeypatch.setattr(messages, "plain_message", lambda *_: None)
     assert decode_reply(parts) == plain == message
+
+
+@pytest.mark.parametrize("message", REQUESTS, ids=lambda m: m.type_name)
+def test_a_plain_request_is_read_as_one_that_is_examined(message, monkeypatch):
+    parts = as_bytes(encode(message))
+    assert plain_request(parts[0], messages.REQUESTS, PROTOCOL_VERSION) is not None
+    plain = decode_request(parts)
+    monkeypatch.setattr(messages, "plain_request", lambda *_: None)
+    assert decode_request(parts) == plain == message
+
+
+def packed_map(*pairs):
+    """Return a msgpack map with these pairs, in which a key may appear twice."""
+    packed = b"".join(msgpack.packb(item) for pair in pairs for item in pair)
+    return bytes([0x80 + len(pairs)]) + packed
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        packed_map(("type", "ping"), ("version", 1), ("t", 1.0), ("t", 2.0)),
+        packed_map(("type", "ping"), ("version", 1), ("unknown", 0)),
+        packed_map(("type", "ping"), ("version", True)),
+        packed_map(("type", "ping"), ("version", PROTOCOL_VERSION + 1)),
+        packed_map(("type", "ping"), ("t", 1.0)),
+        packed_map(("type", "nothing"), ("version", 1)),
+        packed_map(("type", ["ping"]), ("version", 1)),
+        packed_map(("type", "ping"), ("version", 1), ("t", "late")),
+        packed_map(("type", "ping"), ("version", 1), (3, "number")),
+        b"\x91" * 4000,
+        b"",
+    ],
+    ids=lambda header: repr(header[:40]),
+)
+def test_a_request_that_is_not_plain_is_examined(header):
+    assert plain_request(header, messages.REQUESTS, PROTOCOL_VERSION) is None
 
 
 @pytest.mark.parametrize(

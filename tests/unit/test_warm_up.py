@@ -62,7 +62,7 @@ def test_frames_at_the_same_time_tell_no_speed():
 def test_a_view_is_remembered_by_some_of_its_depths():
     depth_m = np.full((12, 16), 2.0)
     depth_m[0, 0] = np.nan
-    seen = SampledView.of(view_of(depth_m, depth_kind="radial"))
+    seen = SampledView.later(view_of(depth_m, depth_kind="radial"))()
     assert seen.object_dpt.shape == (12 // STEP_PX, 16 // STEP_PX)
     np.testing.assert_allclose(seen.object_dpt, 0.5)
     assert seen.hidden_dpt is None
@@ -77,16 +77,16 @@ def test_what_is_hidden_is_remembered_too():
         hidden_color=np.zeros((12, 16, 3), np.uint8),
         hidden_depth_m=hidden_m,
     )
-    hidden_dpt = SampledView.of(view).hidden_dpt
+    hidden_dpt = SampledView.later(view)().hidden_dpt
     assert np.isnan(hidden_dpt[:, :2]).all()
     np.testing.assert_allclose(hidden_dpt[:, 2:], 0.25)
 
 
 def test_a_memory_that_is_used_again_does_not_change_what_is_remembered():
     view = view_of(np.full((12, 16), 2.0), depth_kind="radial")
-    seen = SampledView.of(view)
+    sample = SampledView.later(view)
     view.depth_m[:] = 9.0
-    np.testing.assert_allclose(seen.object_dpt, 0.5)
+    np.testing.assert_allclose(sample().object_dpt, 0.5)
 
 
 def test_a_first_frame_keeps_to_the_settings():
