@@ -25,12 +25,12 @@ def made_fragments(bench, width_px, height_px, surface_count=1):
     n_slots = n_blocks * constants.THREADS
     if bench.gpu is None:
         arrays = bench.renderer._arrays
-        blocks = arrays.get("blocks", n_blocks, BLOCK)[:n_blocks]
+        blocks = _array(arrays, "blocks", n_blocks, BLOCK)
         counts = (blocks["end"] - blocks["first"]).astype(int)
         firsts = blocks["first"].astype(int)
-        made = arrays.get("fragments", n_slots, FRAGMENT)[:n_slots]
+        made = _array(arrays, "fragments", n_slots, FRAGMENT)
         x, y, state = made["x"], made["y"], made["state"]
-        rgb = arrays.get("lights", n_slots, FRAGMENT_LIGHT)[:n_slots]["rgb"]
+        rgb = _array(arrays, "lights", n_slots, FRAGMENT_LIGHT)["rgb"]
     else:
         counts = _read(bench.gpu, "BLOCKS", (n_blocks, 4), np.uint32)[:, 0].astype(int)
         firsts = np.arange(n_blocks) * constants.THREADS
@@ -50,6 +50,10 @@ def made_fragments(bench, width_px, height_px, surface_count=1):
         2 ** level.astype(int),
         rgb[alive],
     )
+
+
+def _array(arrays, name, count, dtype):
+    return np.frombuffer(arrays._buffers[name].memory, dtype, count)
 
 
 def _read(gpu, name, shape, dtype):

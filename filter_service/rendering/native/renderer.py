@@ -336,7 +336,7 @@ class NativeRenderer(OneView):
             picture = output_array(request)
             frame.set_picture(picture)
             self._loops.call("splat", frame.c)
-        eye.arrays.end_frame()
+        frame.eye_arrays.end_frame()
         if frame.c.failed:
             raise RenderFailed("out of memory for the fragment lists of a frame")
         return ViewResult(
