@@ -14,7 +14,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg.lapack import dposv
 
 DIFFERENCE_STEP = 1e-4
 """Finite difference of the Jacobian, in prior deviations; the model is smooth to 1e-9
@@ -229,7 +228,7 @@ def box_minimum(
     `scipy.optimize.lsq_linear`, which decomposes the whole matrix on every pass.
     """
     low, high = room
-    step: NDArray[np.float64] = dposv(hessian, downhill)[1]
+    step = _solved(hessian, downhill)
     side = np.where(step >= high, 1, np.where(step <= low, -1, 0))
     if not side.any():
         return step
@@ -243,6 +242,17 @@ def box_minimum(
             break
         side[worst] = 0
     return step
+
+
+def _solved(
+    hessian: NDArray[np.float64], right: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Solve a positive definite system in half the time of `numpy.linalg.solve`."""
+    # 25 MB, which a process that fits no eye does not need
+    from scipy.linalg.lapack import dposv
+
+    found: NDArray[np.float64] = dposv(hessian, right)[1]
+    return found
 
 
 def _descend_free(
@@ -260,7 +270,7 @@ def _descend_free(
             return step, side
         tied = np.where(side == 0, 0.0, step)
         right = (downhill - hessian @ tied)[free]
-        goal = dposv(hessian[free[:, None], free], right)[1]
+        goal = _solved(hessian[free[:, None], free], right)
         start = step[free]
         over = np.where(goal > high[free], high[free], low[free])
         outside = (goal > high[free]) | (goal < low[free])

@@ -16,7 +16,6 @@ from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.interpolate import BarycentricInterpolator
 
 from estimator.corrections.worn_lens import worn_refraction
 from estimator.eye.assembly import (
@@ -40,6 +39,7 @@ from estimator.eye.tracing import (
     seen_refraction_of_vectors,
 )
 from estimator.optics import prescription as rx
+from estimator.optics.interpolation import polynomial_through
 from estimator.optics.paraxial import entrance_pupil_mm
 from estimator.optics.units import REFERENCE_WAVELENGTH_NM
 from estimator.optics.vergence import ObjectVergence, refraction_at_cornea_dpt
@@ -65,18 +65,6 @@ def falling_count(refractions_dpt: NDArray[np.float64]) -> int:
     usable[1:] &= np.diff(refractions_dpt) < 0.0
     usable[0] = True
     return int(np.argmin(usable)) if not usable.all() else usable.size
-
-
-def polynomial_through(
-    x: NDArray[np.float64], y: NDArray[np.float64]
-) -> BarycentricInterpolator:
-    """Return the polynomial through points, with the same rounding in every process.
-
-    SciPy computes the weights in a random order.  With a separate generator, two
-    processes prepared one eye with wavefronts that differed by the last bits, and
-    images by 1e-7.
-    """
-    return BarycentricInterpolator(x, y, rng=np.random.default_rng(0))
 
 
 State = TypeVar("State", bound=FocusedSurfaces)

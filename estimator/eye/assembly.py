@@ -24,7 +24,6 @@ from typing import cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.optimize import brentq
 
 from estimator.eye.parameters import (
     OFFSET_RADIUS_MM,
@@ -117,6 +116,8 @@ def compat_lens_shape(
     ValueError
         No pair of caps has this volume.
     """
+    from scipy.optimize import brentq  # takes 20 MB, for this rule alone
+
     rim_mm = 10.0 / (diameter_mm - 4.0)
     cap_volume_mm3 = 0.3 * rim_mm * volume_mm3
 
@@ -156,6 +157,8 @@ def _compat_cap_height_mm(
     volume_mm3: float, *, conic_constant: float, diameter_mm: float
 ) -> float:
     """Solve V = (pi/8) D² h (5 b h² + .75 D²)/(6 b h² + .75 D²) for the height h."""
+    from scipy.optimize import brentq
+
     b = 1.0 + conic_constant
     square = 0.75 * diameter_mm**2
 

@@ -19,7 +19,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.interpolate import CubicSpline
 
 from estimator.eye.accommodation import (
     N_FOCUS,
@@ -29,6 +28,7 @@ from estimator.eye.accommodation import (
 from estimator.eye.focusing import FocusedSurfaces, FocusTable, table_pupils_mm
 from estimator.eye.tracing import TraceFailed, refraction_of_packed, seen_refraction_dpt
 from estimator.optics import prescription as rx
+from estimator.optics.interpolation import CubicSpline
 from estimator.optics.paraxial import entrance_pupil_mm
 from estimator.optics.raytrace import obstruction
 from estimator.optics.surfaces import EyeSurfaces, media_indices, pack_eye
@@ -75,7 +75,7 @@ class SurfaceModel:
     @cached_property
     def _weights(self) -> CubicSpline:
         nodes = np.array([0.0, *self.accommodations_dpt])
-        return CubicSpline(nodes, np.eye(nodes.size), bc_type="not-a-knot")
+        return CubicSpline(nodes, np.eye(nodes.size))
 
     def at(self, nominal_dpt: float) -> EyeSurfaces:
         """Return the eye at a nominal accommodation.

@@ -61,6 +61,10 @@ from estimator.wavefront.field_wavefronts import (
 )
 from estimator.wavefront.moved_plane import moved_polynomial
 
+MAX_KNOWN = 8
+"""Number of arrays of fields whose phases are kept: the plan of an eye's nodes asks a
+quarter of them again, for other pupils and states of accommodation."""
+
 
 class PeripheralResidual:
     """Phase in the plane of the entrance pupil, over a range of fields.
@@ -82,6 +86,7 @@ class PeripheralResidual:
         nodes_deg: FieldNodes,
     ):
         self.change = change
+        self._known_um: dict[tuple[bytes, bytes], NDArray[np.float64]] = {}
         usual = clamped_eye(change, eye)
         self._traced = _traced(usual, *nodes_deg)
         self._depth_mm = usual.accommodating.entrance_pupil_mm
@@ -99,7 +104,20 @@ class PeripheralResidual:
         self, h_deg: NDArray[np.float64], v_deg: NDArray[np.float64]
     ) -> NDArray[np.float64]:
         """Return monomials (n, 28), um/mm^degree, at fields (n,) within the range."""
-        return self._difference_um(self._traced, h_deg, v_deg) - self._on_axis_um
+        key = h_deg.tobytes(), v_deg.tobytes()
+        found_um = self._known_um.get(key)
+        if found_um is None:
+            found_um = self._difference_um(self._traced, h_deg, v_deg)
+            found_um = found_um - self._on_axis_um
+            found_um.flags.writeable = False
+            # A new dict, because other threads may read the old one.
+            known = [*self._known_um.items(), (key, found_um)]
+            self._known_um = dict(known[-MAX_KNOWN:])
+        return found_um
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Pickle without known phases, which take a megabyte."""
+        return vars(self) | {"_known_um": {}}
 
     def _difference_um(
         self, traced: FieldInterpolation, h_deg: NDArray[Any], v_deg: NDArray[Any]

@@ -13,6 +13,7 @@ paraxial          power, cardinal points and entrance pupil
 vergence          object distances and vergences, and refraction by wavelength
 pupil_screen      interface of a complex amplitude in the pupil, for wave optics
 pinhole           directions and local scale of a pinhole image
+interpolation     splines and polynomials through given points
 
 Terms:
 

@@ -41,9 +41,9 @@ from typing import Any, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.interpolate import CubicSpline
 
 from estimator.bounded_files import InvalidFile, read_bytes, reason_of
+from estimator.optics.interpolation import CubicSpline
 from estimator.optics.zernike import N_TERMS, flip_horizontal
 
 SMOOTHING_RATIO = 0.15
@@ -221,8 +221,10 @@ def meridian_weights(h_deg: ArrayLike) -> NDArray[np.float64]:
     spline = _spline()
     inside = np.clip(h_deg, -MEASURED_DEG, MEASURED_DEG)
     beyond = h_deg - inside
+    if not beyond.any():
+        return spline(inside)
     faded = np.sign(beyond) * FADE_DEG * -np.expm1(-np.abs(beyond) / FADE_DEG)
-    return spline(inside) + faded[..., None] * spline(inside, 1)
+    return spline(inside) + faded[..., None] * spline.slopes(inside)
 
 
 @cache

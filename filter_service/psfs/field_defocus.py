@@ -2,16 +2,14 @@
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from estimator.field.eye_optics import EyeOptics
+from estimator.optics.interpolation import CubicSpline
 from filter_service.planning.grid import GREEN, GridSpec
-
-if TYPE_CHECKING:
-    from scipy.interpolate import BSpline
 
 COLUMNS, ROWS = 17, 11
 """Number of directions at which the eye is evaluated.  Between them, over +-40 x 25 deg
@@ -46,13 +44,11 @@ class FieldAxes:
         return self.v_deg.size, self.h_deg.size
 
     @cached_property
-    def _splines(self) -> "tuple[BSpline, BSpline]":
-        from scipy.interpolate import make_interp_spline
-
-        return tuple(
-            make_interp_spline(axis, np.eye(axis.size), k=3)
-            for axis in (self.v_deg, self.h_deg)
+    def _splines(self) -> tuple[CubicSpline, CubicSpline]:
+        rows, columns = (
+            CubicSpline(axis, np.eye(axis.size)) for axis in (self.v_deg, self.h_deg)
         )
+        return rows, columns
 
     def weights(
         self, h_deg: ArrayLike, v_deg: ArrayLike

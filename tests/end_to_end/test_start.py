@@ -31,7 +31,7 @@ render_worker_process.main()
 
 LIGHT = """
 import json, sys
-from filter_service.service import {module}
+import filter_service.{module}
 print(json.dumps(sorted({{name.partition(".")[0] for name in sys.modules}})))
 """
 
@@ -76,8 +76,9 @@ def test_a_service_is_ready_before_it_loads_scipy():
 @pytest.mark.parametrize(
     ("module", "heavy"),
     [
-        ("front_end", NOT_BEFORE_READY | {"moderngl", "OpenGL"}),
-        ("supervisor", NOT_BEFORE_READY | {"moderngl", "OpenGL", "zmq"}),
+        ("service.front_end", NOT_BEFORE_READY | {"moderngl", "OpenGL"}),
+        ("service.supervisor", NOT_BEFORE_READY | {"moderngl", "OpenGL", "zmq"}),
+        ("building.from_profile", NOT_BEFORE_READY | {"zmq"}),
     ],
 )
 def test_what_stands_before_the_frames_is_light(module, heavy):
