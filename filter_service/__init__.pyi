@@ -1,5 +1,7 @@
 from .camera import Camera as Camera
 from .camera import tangents_from_fov as tangents_from_fov
+from .correcting.correction import Correction as Correction
+from .correcting.correction import correct as correct
 from .correcting.sensitivity import SensitivityWeight as SensitivityWeight
 from .correcting.solver import PictureOperator as PictureOperator
 from .correcting.solver import PictureSolution as PictureSolution

@@ -412,7 +412,9 @@ def _scaled(stored: NDArray[Any], depth_scale: float) -> NDArray[np.float32]:
     return depth_m
 
 
-def check_output(path: Path, suffixes: tuple[str, ...] = OUTPUT_SUFFIXES) -> None:
+def check_output(
+    path: Path, suffixes: tuple[str, ...] = OUTPUT_SUFFIXES, *, option: str = "out"
+) -> None:
     """Reject an output path that cannot be written, before any work is done.
 
     Raises
@@ -423,13 +425,15 @@ def check_output(path: Path, suffixes: tuple[str, ...] = OUTPUT_SUFFIXES) -> Non
     """
     if path.suffix.lower() not in suffixes:
         found = f"'{path.suffix}' is not a kind of output"
-        _raise_invalid("out", path, found, "a name that ends in " + ", ".join(suffixes))
+        _raise_invalid(
+            option, path, found, "a name that ends in " + ", ".join(suffixes)
+        )
     if not path.absolute().parent.is_dir():
-        _raise_invalid("out", path, "its folder does not exist", "an existing folder")
+        _raise_invalid(option, path, "its folder does not exist", "an existing folder")
     if not os.access(path.absolute().parent, os.W_OK):
-        _raise_invalid("out", path, "its folder is read-only", "a writable folder")
+        _raise_invalid(option, path, "its folder is read-only", "a writable folder")
     if path.is_dir():
-        _raise_invalid("out", path, "it is a folder", "the name of a file")
+        _raise_invalid(option, path, "it is a folder", "the name of a file")
 
 
 def write_image(

@@ -66,6 +66,7 @@ from filter_service import BadMessage as BadMessage
 from filter_service import BuildingEye as BuildingEye
 from filter_service import Camera as Camera
 from filter_service import ColorImage as ColorImage
+from filter_service import Correction as Correction
 from filter_service import DepthProjection as DepthProjection
 from filter_service import EyeFailed as EyeFailed
 from filter_service import EyeFilter as EyeFilter
@@ -87,6 +88,7 @@ from filter_service import SensitivityWeight as SensitivityWeight
 from filter_service import TextureView as TextureView
 from filter_service import ViewState as ViewState
 from filter_service import as_views as as_views
+from filter_service import correct as correct
 from filter_service import errors as errors
 from filter_service import is_software_renderer as is_software_renderer
 from filter_service import nearest_picture as nearest_picture

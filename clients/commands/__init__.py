@@ -4,6 +4,7 @@ program        the `ocufilter` program and the table of its commands
 options        options that commands share: settings, profiles, sizes
 service        status, latency, keys and eyes: a running service and its folders
 filter_image   filter: one image
+correct_image  correct: a picture solved for a viewer
 eye            estimate and field: an eye and its visual field
 optics         wavefront and psf: an eye in one direction
 checkout       bench and paper, which need a checkout

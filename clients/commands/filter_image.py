@@ -49,16 +49,56 @@ FOCAL_LIMITS_PX = (1.0, 1e6)
 DISTANCE_LIMITS_M = (1.0 / MAX_VERGENCE_DPT, float("inf"))
 
 
+Color = Annotated[
+    Path,
+    typer.Option(
+        metavar="IMG",
+        help="PNG, JPEG, PPM, .npy (uint8 sRGB or linear floats) or .exr.  "
+        "Linear light may be above 1 and below 0.",
+    ),
+]
+Depth = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="FILE",
+        help="Depth: floats in meters (.npy, TIFF, .exr, .pfm), or integers in "
+        "millimeters or units of --depth-scale (16-bit PNG, .pgm, TIFF, .npy).  "
+        "inf is infinity; 0, negative, NaN and 16-bit 65535 are missing.",
+    ),
+]
+DistanceM = Annotated[
+    float | None,
+    typer.Option(
+        help="Distance of the entire image, instead of --depth; inf is infinity."
+    ),
+]
+FovDeg = Annotated[float | None, typer.Option(help="Vertical field of view, deg.")]
+FocalPx = Annotated[
+    float | None, typer.Option(help="Focal length in px, instead of --fov-deg.")
+]
+Intrinsics = Annotated[
+    str | None,
+    typer.Option(
+        metavar="FX,FY,CX,CY", help="Camera matrix in px, instead of --fov-deg."
+    ),
+]
+PupilMm = Annotated[float, typer.Option(help="Entrance pupil, mm.")]
+FocusDpt = Annotated[float, typer.Option(help="Focus distance, dpt; 0 is infinity.")]
+DepthKindOption = Annotated[
+    DepthKind,
+    typer.Option(help="planar: view-space z; radial: distance from the camera."),
+]
+DepthScale = Annotated[
+    float | None,
+    typer.Option(
+        help="Meters per unit of the depth file; by default 0.001 for integers."
+    ),
+]
+
+
 @with_setting_options()
 def filter_image(
-    color: Annotated[
-        Path,
-        typer.Option(
-            metavar="IMG",
-            help="PNG, JPEG, PPM, .npy (uint8 sRGB or linear floats) or .exr.  "
-            "Linear light may be above 1 and below 0.",
-        ),
-    ],
+    color: Color,
     profile: Annotated[
         str,
         typer.Option(
@@ -73,33 +113,11 @@ def filter_image(
             "--out", "-o", help="Output: .png (sRGB), .npy or .exr (linear floats)."
         ),
     ],
-    depth: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE",
-            help="Depth: floats in meters (.npy, TIFF, .exr, .pfm), or integers in "
-            "millimeters or units of --depth-scale (16-bit PNG, .pgm, TIFF, .npy).  "
-            "inf is infinity; 0, negative, NaN and 16-bit 65535 are missing.",
-        ),
-    ] = None,
-    distance_m: Annotated[
-        float | None,
-        typer.Option(
-            help="Distance of the entire image, instead of --depth; inf is infinity."
-        ),
-    ] = None,
-    fov_deg: Annotated[
-        float | None, typer.Option(help="Vertical field of view, deg.")
-    ] = None,
-    focal_px: Annotated[
-        float | None, typer.Option(help="Focal length in px, instead of --fov-deg.")
-    ] = None,
-    intrinsics: Annotated[
-        str | None,
-        typer.Option(
-            metavar="FX,FY,CX,CY", help="Camera matrix in px, instead of --fov-deg."
-        ),
-    ] = None,
+    depth: Depth = None,
+    distance_m: DistanceM = None,
+    fov_deg: FovDeg = None,
+    focal_px: FocalPx = None,
+    intrinsics: Intrinsics = None,
     hidden_color: Annotated[
         Path | None,
         typer.Option(
@@ -116,24 +134,14 @@ def filter_image(
             "nothing is hidden.",
         ),
     ] = None,
-    pupil_mm: Annotated[float, typer.Option(help="Entrance pupil, mm.")] = 4.0,
-    focus_dpt: Annotated[
-        float, typer.Option(help="Focus distance, dpt; 0 is infinity.")
-    ] = 0.0,
+    pupil_mm: PupilMm = 4.0,
+    focus_dpt: FocusDpt = 0.0,
     accumulation: Annotated[
         Accumulation,
         typer.Option(help="coverage: conserves light; paper: the published rule."),
     ] = "coverage",
-    depth_kind: Annotated[
-        DepthKind,
-        typer.Option(help="planar: view-space z; radial: distance from the camera."),
-    ] = "planar",
-    depth_scale: Annotated[
-        float | None,
-        typer.Option(
-            help="Meters per unit of the depth file; by default 0.001 for integers."
-        ),
-    ] = None,
+    depth_kind: DepthKindOption = "planar",
+    depth_scale: DepthScale = None,
     no_merge: Annotated[
         bool, typer.Option("--no-merge", help="Do not merge similar pixels.")
     ] = False,
@@ -172,10 +180,10 @@ def filter_image(
     """
     check_range("--pupil-mm", pupil_mm, PUPIL_LIMITS_MM)
     check_range("--focus-dpt", focus_dpt, FOCUS_LIMITS_DPT)
-    _check_one_of({"--depth": depth, "--distance-m": distance_m})
+    check_one_of({"--depth": depth, "--distance-m": distance_m})
     if distance_m is not None:
         check_range("--distance-m", distance_m, DISTANCE_LIMITS_M)
-    _check_one_of(
+    check_one_of(
         {"--fov-deg": fov_deg, "--focal-px": focal_px, "--intrinsics": intrinsics}
     )
     check_range("--render-tolerance", render_tolerance, (0.0, MAX_RENDER_TOLERANCE))
@@ -189,11 +197,11 @@ def filter_image(
     image_files.check_output(out)
     output = _output(out, half=half)
     eye = load_profile(profile)
-    view, grid, file_notes = _read_view(
+    view, grid, file_notes = read_view(
         color,
         depth,
         distance_m=distance_m,
-        tangents_of=partial(_tangents, fov_deg, focal_px, intrinsics),
+        tangents_of=partial(image_tangents, fov_deg, focal_px, intrinsics),
         depth_kind=depth_kind,
         depth_scale=depth_scale,
         hidden_paths=(hidden_color, hidden_depth),
@@ -240,7 +248,7 @@ def filter_image(
         _report(summary)
 
 
-def _check_one_of(options: dict[str, object]) -> None:
+def check_one_of(options: dict[str, object]) -> None:
     """Raise ValueError unless exactly one of several options is given."""
     given = [name for name, value in options.items() if value is not None]
     if len(given) != 1:
@@ -249,7 +257,7 @@ def _check_one_of(options: dict[str, object]) -> None:
         raise ValueError(f"{found}: {problem}; allowed: one of {', '.join(options)}")
 
 
-def _tangents(
+def image_tangents(
     fov_deg: float | None,
     focal_px: float | None,
     intrinsics: str | None,
@@ -344,7 +352,7 @@ def _output(out: Path, *, half: bool) -> Output:
     return ("linear16" if half else "linear") if linear else "srgb8"
 
 
-def _read_view(
+def read_view(
     color_path: Path,
     depth_path: Path | None,
     *,

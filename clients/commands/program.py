@@ -41,6 +41,10 @@ COMMANDS = {
         "clients.commands.filter_image:filter_image",
         "Filter one image with depth through one eye.",
     ),
+    "correct": (
+        "clients.commands.correct_image:correct_image",
+        "Solve for the picture that a viewer sees as it was meant.",
+    ),
     "batch": (
         "clients.batch.program:batch",
         "Filter folders and videos of color and depth, on all cores.",

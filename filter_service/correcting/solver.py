@@ -31,6 +31,9 @@ MAX_POWER_STEPS, POWER_CHANGE = 10, 0.01
 """The power iteration ends when the norm changes by a smaller ratio.  It then is a
 lower bound, which the solver raises when a step meets a greater curvature."""
 
+LEAST_SCALE_RATIO = 0.1
+"""Smallest scale of a pixel, relative to the mean."""
+
 CURVATURE_MARGIN = 1.02
 ROUNDING_RATIO = 1e-12
 """Squares of differences below this ratio of the targets' squares are rounding."""
@@ -41,11 +44,12 @@ LONG_STEP = 1.3
 FAR_RATIO, STEP_SHRINKAGE = 3.0, 0.96
 """Long steps shrink when a change of the picture exceeds the first by this ratio."""
 
-HALVES_RATIO = 1.5
+HALVES_RATIO = 1.0
 """Errors within c / k² of the least after k iterations fall in the second half by three
-times the remaining distance; 1.5 leaves a margin."""
+times the remaining distance; 1 leaves a margin."""
 
 MIN_ITERATIONS, MAX_ITERATIONS = 10, 100_000
+TOLERANCE_LIMITS = 0.0, 1.0
 
 
 class PictureOperator(Protocol):
@@ -151,13 +155,14 @@ def nearest_picture(
     """
     problem = _Problem(operators, targets, weight)
     low, high = _checked_limits(limits)
-    _check_number("tolerance", tolerance, 0.0, 1.0)
-    _check_number("max_iterations", max_iterations, 1, MAX_ITERATIONS)
+    check_number("tolerance", tolerance, TOLERANCE_LIMITS)
+    check_number("max_iterations", max_iterations, (1, MAX_ITERATIONS))
     if start is None:
         x = np.full(problem.color_shape, 0.5 * (low + high), np.float32)
     else:
         x = _as_image("start", start, problem.color_shape).clip(low, high)
-    curvature, long_step = problem.curvature(), LONG_STEP
+    scales = problem.scales()
+    curvature, long_step = problem.curvature(scales), LONG_STEP
     values = problem.values(x)
     y, at_y = x, values
     errors = [problem.error(values)]
@@ -165,19 +170,22 @@ def nearest_picture(
     has_converged = False
     for k in range(1, max_iterations + 1):
         slope = problem.gradient(at_y)
-        bound = problem.error(at_y) - 2.0 * problem.scale * _gap(y, slope, low, high)
+        bound = problem.error(at_y) - 2.0 * problem.per_value * _gap(
+            y, slope, low, high
+        )
         lower_bound = min(max(lower_bound, bound), errors[-1])
         while True:
-            x_new = np.clip(y - np.float32(long_step / curvature) * slope, low, high)
+            x_new = np.clip(y - slope * (long_step / curvature / scales), low, high)
             new = problem.values(x_new)
             step = x_new - y
-            length, bent = _dot(step, step), problem.squared_distance(new, at_y)
+            scaled = scales * step
+            length, bent = _dot(scaled, step), problem.squared_distance(new, at_y)
             limit = CURVATURE_MARGIN * curvature * length
             if bent <= limit + problem.rounding or length == 0.0:
                 break
             curvature = CURVATURE_MARGIN * bent / length
         change = x_new - x
-        if _dot(step, change) <= 0.0:
+        if _dot(scaled, change) <= 0.0:
             y, at_y = x_new, new
         else:
             y = x_new + change
@@ -240,7 +248,7 @@ class _Problem:
             for k, (operator, target) in enumerate(zip(operators, targets, strict=True))
         ]
         n_values = sum(target.size for target in self._targets)
-        self.scale = 1.0 / n_values
+        self.per_value = 1.0 / n_values
         self.rounding = ROUNDING_RATIO * sum(_dot(t, t) for t in self._targets)
 
     def values(self, x: Image) -> list[Image]:
@@ -253,7 +261,7 @@ class _Problem:
 
     def error(self, values: list[Image]) -> float:
         """Return the mean square of the weighted differences."""
-        return self.scale * sum(_dot(each, each) for each in values)
+        return self.per_value * sum(_dot(each, each) for each in values)
 
     def gradient(self, values: list[Image]) -> Image:
         """Return the gradient of half the sum of squares."""
@@ -270,19 +278,32 @@ class _Problem:
         pairs = zip(first, second, strict=True)
         return sum(_dot(d, d) for d in (a - b for a, b in pairs))
 
-    def curvature(self) -> float:
+    def scales(self) -> Image:
+        """Return scales of pixels in which the curvature varies less.
+
+        Without a weight, no curvature exceeds 1 in them: the sums of rows of A'A, which
+        has no negative entries.  They are 1 but near edges, where they are 0.4 to 1.5.
+        """
+        ones = np.ones(self.color_shape, np.float32)
+        images = [operator.forward(ones) for operator in self._operators]
+        pairs = zip(self._operators, images, strict=True)
+        sums = np.sum([operator.adjoint(image) for operator, image in pairs], axis=0)
+        least = LEAST_SCALE_RATIO * float(sums.mean())
+        return np.maximum(sums, np.float32(least)) if least > 0.0 else ones
+
+    def curvature(self, scales: Image) -> float:
         """Return the greatest curvature, by a power iteration from positive noise."""
         noise = np.random.default_rng(0).random(self.color_shape, np.float32)
         found = 0.0
         for _ in range(MAX_POWER_STEPS):
-            noise /= np.float32(math.sqrt(_dot(noise, noise)))
+            noise /= np.float32(math.sqrt(_dot(noise, scales * noise)))
             images = [self._weighted(op.forward(noise)) for op in self._operators]
             before, found = found, sum(_dot(each, each) for each in images)
             if found == 0.0:
                 return 1.0
             if found - before <= POWER_CHANGE * found:
                 break
-            noise = self.gradient(images)
+            noise = self.gradient(images) / scales
         return found
 
 
@@ -317,7 +338,9 @@ def _checked_limits(limits: tuple[float, float]) -> tuple[float, float]:
     return low, high
 
 
-def _check_number(field: str, value: float, low: float, high: float) -> None:
+def check_number(field: str, value: float, limits: tuple[float, float]) -> None:
+    """Raise BadMessage unless a number is within limits."""
+    low, high = limits
     if not low <= value <= high:
         raise BadMessage(
             f"it is {value!r}", field=field, allowed=f"{low:g} to {high:g}"

@@ -5,7 +5,7 @@ from functools import partial
 import numpy as np
 import pytest
 
-from clients.commands.filter_image import _read_view, _tangents
+from clients.commands.filter_image import image_tangents, read_view
 from filter_service.camera import PixelGrid
 from filter_service.image_files import write_image
 
@@ -17,8 +17,8 @@ def light(rng):
 
 def view_of(color, depth=None, *, camera=(90.0, None, None), **how):
     how = {"distance_m": 2.0 if depth is None else None, "depth_scale": None, **how}
-    tangents_of = partial(_tangents, *camera)
-    return _read_view(color, depth, tangents_of=tangents_of, depth_kind="planar", **how)
+    tangents_of = partial(image_tangents, *camera)
+    return read_view(color, depth, tangents_of=tangents_of, depth_kind="planar", **how)
 
 
 @pytest.mark.parametrize(
