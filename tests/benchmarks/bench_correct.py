@@ -1,0 +1,308 @@
+"""Pictures solved for viewers: time, retinal error, acuity, and Wiener filters.
+
+    python -m tests.benchmarks.bench_correct [--quick] [--json]
+
+Viewers of -1 and -2 dpt, with astigmatism and with keratoconus look at letters and at a
+photograph of scikit-image, far away, through 3 and 4 mm.  Solved: for their state, and
+for ranges of 0.5 mm and 0.25 dpt, judged by the mean over them and at one corner, 0.5
+mm and 0.25 dpt off.  Wiener filters with one PSF and with one per tile get the
+regularization that is best in each case, are clipped, and have the same target.  Acuity
+is that of the transfer from the chart to the retina, up to the frequency of the pixels.
+Frames of 480x270 show the time until the error is within 0.01 of the least one, of
+1,000 iterations, relative to that of the target displayed as it is.  Writes
+results/correct.json.
+"""
+
+import argparse
+import time
+from contextlib import ExitStack
+from functools import partial
+from itertools import product
+
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+from skimage import data
+
+from filter_service.camera import Camera
+from filter_service.color_encoding import srgb_curve
+from filter_service.correcting import correct, nearest_picture
+from filter_service.correcting.correction import compressed, psnr_db
+from filter_service.filtering.eye_filter import EyeFilter
+from filter_service.filtering.shared_builder import open_inline_builder
+from filter_service.rgbd_view import RgbdView
+from tests.benchmarks.harness import KeptRows, Row, memory_mb, publish
+from tests.benchmarks.wiener_pictures import by_one_psf, by_tiles, log_mar_of_picture
+
+
+def prescription(sphere_dpt: float, **more) -> dict:
+    """Body of a profile."""
+    return {"kind": "prescription", "sphere_dpt": sphere_dpt} | more
+
+
+VIEWERS = {
+    "-1 dpt": prescription(-1.0),
+    "-2 dpt": prescription(-2.0),
+    "astigmatism": prescription(0.0, cylinder_dpt=-2.0, axis_deg=30.0),
+    "keratoconus": {"kind": "preset", "name": "keratoconus"},
+}
+TARGETS = {
+    "-3 dpt": prescription(-3.0),
+    "cataract": {
+        "kind": "preset",
+        "name": "emmetropia",
+        "age_years": 70,
+        "straylight": {"cataract": "nuclear"},
+    },
+    "emmetropia": {"kind": "preset", "name": "emmetropia"},
+}
+PUPILS_MM = 3.0, 4.0
+CONTRASTS = 1.0, 0.5
+PUPIL_RANGE_MM, FOCUS_RANGE_DPT = 0.5, 0.25
+SMALL, SMALL_FOV_DEG = (240, 135), 4.5
+WIDE_FOV_DEG = 30.0
+LARGE, LARGE_FOV_DEG = (480, 270), 9.0
+GOAL = 0.01
+LONG_ITERATIONS, QUICK_ITERATIONS = 1000, 200
+LINES = (
+    ("N K H S", 0.34, 0.01),
+    ("Z O V R C D", 0.17, 0.39),
+    ("S N D H K O R Z", 0.10, 0.61),
+    ("V C O Z S N D R H K", 0.06, 0.77),
+)
+"""Text, height and top of the lines of the chart, relative to the picture's height."""
+
+
+def letters(size: tuple[int, int]) -> np.ndarray:
+    """Black letters on white, linear light."""
+    large = Image.new("L", (4 * size[0], 4 * size[1]), 255)
+    draw = ImageDraw.Draw(large)
+    for text, height, top in LINES:
+        font = ImageFont.load_default(size=round(height * large.height))
+        place = large.width / 2, top * large.height
+        draw.text(place, text, fill=0, font=font, anchor="ma")
+    shown = np.asarray(large.resize(size, Image.Resampling.BOX), np.float32) / 255.0
+    return np.repeat(shown[..., None], 3, axis=2)
+
+
+def photograph(size: tuple[int, int]) -> np.ndarray:
+    """A part of a photograph, linear light."""
+    part = Image.fromarray(data.astronaut()[100:388]).resize(size)
+    return srgb_curve(np.asarray(part, np.float64) / 255.0).astype(np.float32)
+
+
+PICTURES = {"letters": letters, "photograph": photograph}
+
+
+class Viewer:
+    """The operators of an eye for a far display."""
+
+    def __init__(self, closing, builder, profile, camera):
+        shape = camera.height_px, camera.width_px
+        self.far_m = np.full(shape, np.inf, np.float32)
+        self.near_m = np.full(shape, 1.0 / FOCUS_RANGE_DPT, np.float32)
+        settings = {
+            "pupil_range_mm": (min(PUPILS_MM) - 0.5, max(PUPILS_MM) + 0.5),
+            "object_range_dpt": (0.0, FOCUS_RANGE_DPT),
+        }
+        self._eye = closing.enter_context(
+            EyeFilter(profile, camera, settings, builder=builder)
+        )
+        color = np.zeros((*shape, 3), np.uint8)
+        state = {"pupil_diameter_mm": PUPILS_MM[0], "focus_dpt": 0.0}
+        self._relaxed_dpt = self._eye.filter(color, self.far_m, **state).focus_dpt
+
+    def operator(self, pupil_mm, off_dpt=0.0):
+        """Operator of a pupil, and of a focus that is nearer by so much."""
+        depth_m, focus_dpt = self.far_m, 0.0
+        if off_dpt < 0.0:
+            depth_m = self.near_m
+        elif off_dpt > 0.0:
+            focus_dpt = self._relaxed_dpt + off_dpt
+        return self._eye.operator(
+            depth_m, pupil_diameter_mm=pupil_mm, focus_dpt=focus_dpt
+        )
+
+    def range(self, pupil_mm):
+        """Operators that `correct` uses for the ranges."""
+        return [
+            self.operator(pupil_mm),
+            self.operator(pupil_mm - PUPIL_RANGE_MM),
+            self.operator(pupil_mm + PUPIL_RANGE_MM),
+            self.operator(pupil_mm, FOCUS_RANGE_DPT),
+            self.operator(pupil_mm, -FOCUS_RANGE_DPT),
+        ]
+
+
+def compared(camera, viewer, pupil_mm, picture, contrast):
+    """Yield a method's name, its time in s, and PSNRs and acuities as a dict."""
+    operators = viewer.range(pupil_mm)
+    corner = viewer.operator(pupil_mm + PUPIL_RANGE_MM, FOCUS_RANGE_DPT)
+    image = PICTURES[picture]((camera.width_px, camera.height_px))
+    target = compressed(image, contrast=contrast, brightness=None)
+    judges = {"nominal": operators[:1], "range": operators, "corner": [corner]}
+
+    def judged(pictures_of):
+        """Best PSNR by each judge of the pictures for it; acuity of the nominal one."""
+        found = {}
+        for judge, seen_by in judges.items():
+            scores = []
+            for x in pictures_of[judge]:
+                seen = [op.forward(x) for op in seen_by]
+                scores.append((psnr_db(seen, target), seen[0]))
+            best_db, seen = max(scores, key=lambda score: score[0])
+            found[f"{judge}_db"] = best_db
+            if judge == "nominal" and picture == "letters":
+                found["log_mar"] = log_mar_of_picture(seen, image, camera)
+        return found
+
+    plain = target.clip(0.0, 1.0)
+    yield "none", 0.0, judged({judge: [plain] for judge in judges})
+    begin_s = time.perf_counter()
+    nominal = nearest_picture(operators[:1], [target], start=target)
+    solve_s = time.perf_counter() - begin_s
+    robust = nearest_picture(operators, [target] * len(operators), start=target)
+    pictures = {judge: [robust.color] for judge in judges}
+    pictures["nominal"] = [nominal.color]
+    yield "solved", solve_s, judged(pictures)
+    for name, filters in (("Wiener, one PSF", by_one_psf), ("Wiener, tiles", by_tiles)):
+        begin_s = time.perf_counter()
+        candidates = filters(operators[0], target)
+        filter_s = (time.perf_counter() - begin_s) / len(candidates)
+        yield name, filter_s, judged(dict.fromkeys(judges, candidates))
+
+
+def comparison_rows(builder, cases):
+    """Rows of all methods, and lists of all of their measures."""
+    for fov_deg, name, pupil_mm, picture, contrast in cases:
+        camera = Camera.from_fov(fov_deg, width_px=SMALL[0], height_px=SMALL[1])
+        with ExitStack() as closing:
+            viewer = Viewer(closing, builder, VIEWERS[name], camera)
+            case = f"{name}, {pupil_mm:g} mm"
+            setting = f"{picture}, contrast {contrast:g}, {fov_deg:g} deg"
+            for method, seconds, found in compared(
+                camera, viewer, pupil_mm, picture, contrast
+            ):
+                details = {"method": method, "case": case, "setting": setting}
+                over_db = -20.0 * np.log10(contrast)
+                for judge in ("nominal", "range", "corner"):
+                    details[f"{judge}_db"] = round(found[f"{judge}_db"], 2)
+                details["nominal_over_contrast_db"] = round(
+                    found["nominal_db"] - over_db, 2
+                )
+                if "log_mar" in found:
+                    details["log_mar"] = round(found["log_mar"], 3)
+                row = Row(
+                    *("correct", method, case, setting, 1, 1e3 * seconds),
+                    *(1e3 * seconds, memory_mb(), "retinal psnr_db"),
+                    *(found["nominal_db"], "the target"),
+                )
+                yield row, details
+
+
+def shown_rows(builder):
+    """Rows of a viewer of -1 dpt who sees what another eye sees."""
+    camera = Camera.from_fov(LARGE_FOV_DEG, width_px=LARGE[0], height_px=LARGE[1])
+    far_m = np.full(LARGE[::-1], np.inf, np.float32)
+    for (name, target_eye), picture in product(TARGETS.items(), PICTURES):
+        found = correct(
+            RgbdView(PICTURES[picture](LARGE), far_m, camera.tangents),
+            VIEWERS["-1 dpt"],
+            target_eye=target_eye,
+            pupil_diameter_mm=4.0,
+            focus_dpt=0.0,
+            builder=builder,
+        )
+        for method, psnr, seconds in (
+            ("as displayed", found.psnr_before_db, 0.0),
+            ("solved", found.psnr_after_db, found.solve_s),
+        ):
+            yield Row(
+                *("correct", method, f"-1 dpt sees {name}", picture, 1),
+                *(1e3 * seconds, 1e3 * seconds, memory_mb(), "retinal psnr_db", psnr),
+                "what the eye sees",
+            )
+
+
+def _add_time(times_s, *_):
+    times_s.append(time.perf_counter())
+
+
+def speed_rows(builder, cases, long_iterations):
+    """Rows of the time until the goal, and until the solver stops."""
+    camera = Camera.from_fov(LARGE_FOV_DEG, width_px=LARGE[0], height_px=LARGE[1])
+    for name, picture, contrast in cases:
+        with ExitStack() as closing:
+            viewer = Viewer(closing, builder, VIEWERS[name], camera)
+            operator = viewer.operator(4.0)
+            image = PICTURES[picture](LARGE)
+            target = compressed(image, contrast=contrast, brightness=None)
+            times_s = [time.perf_counter()]
+            found = nearest_picture(
+                [operator],
+                [target],
+                start=target,
+                on_iteration=partial(_add_time, times_s),
+            )
+            least = min(
+                nearest_picture(
+                    [operator],
+                    [target],
+                    start=target,
+                    tolerance=0.0,
+                    max_iterations=long_iterations,
+                ).errors
+            )
+        start = found.errors[0]
+        ratios = (np.minimum.accumulate(found.errors) - least) / (start - least)
+        n_goal = int(np.argmax(ratios <= GOAL)) if ratios[-1] <= GOAL else len(ratios)
+        setting = f"{picture}, contrast {contrast:g}"
+        for method, n in ((f"to {GOAL:g}", n_goal), ("stop", len(ratios) - 1)):
+            n_last = min(n, len(ratios) - 1)
+            seconds = times_s[n_last] - times_s[0]
+            yield Row(
+                *("correct", method, f"{name}, 4 mm", setting, n_last, 1e3 * seconds),
+                *(1e3 * seconds, memory_mb(), "(f-f*)/(f0-f*)", float(ratios[n_last])),
+                f"{long_iterations} iterations",
+            )
+
+
+def main() -> None:
+    """Run from the command line."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--quick", action="store_true", help="few cases")
+    parser.add_argument("--json", action="store_true", help="print the report alone")
+    options = parser.parse_args()
+    cases = [
+        *product((SMALL_FOV_DEG,), VIEWERS, PUPILS_MM, PICTURES, CONTRASTS),
+        *product((WIDE_FOV_DEG,), ("-2 dpt", "keratoconus"), (4.0,), PICTURES, (0.5,)),
+    ]
+    speed_cases = list(product(("-1 dpt", "keratoconus"), PICTURES, CONTRASTS))
+    n_iterations = LONG_ITERATIONS
+    if options.quick:
+        cases, speed_cases = cases[:1], speed_cases[:1]
+        n_iterations = QUICK_ITERATIONS
+    kept, rows, details = KeptRows("correct"), [], []
+    with ExitStack() as closing:
+        builder = open_inline_builder(closing, engine="native")
+        for row in speed_rows(builder, speed_cases, n_iterations):
+            kept.add(row)
+            rows.append(row)
+        if not options.quick:
+            for row in shown_rows(builder):
+                kept.add(row)
+                rows.append(row)
+        for row, found in comparison_rows(builder, cases):
+            kept.add(row)
+            rows.append(row)
+            details.append(found)
+    publish(
+        "correct",
+        rows,
+        as_json=options.json,
+        is_whole=not options.quick,
+        details={"comparison": details},
+    )
+
+
+if __name__ == "__main__":
+    main()
