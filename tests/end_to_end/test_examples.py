@@ -144,11 +144,24 @@ def test_a_mesh_of_trimesh_blurs_where_the_eye_focuses_before_it(
     assert steepest(blurred) < 0.7 * steepest(sharp)
 
 
+@pytest.mark.clients
+def test_a_card_that_was_solved_for_a_viewer_is_seen_sharper(run, capsys):
+    page = run("11_correct")
+    before, after = (cell(page, 1, column, (2, 3))[:60, 50:190] for column in (0, 1))
+    assert steepest(after) > 1.05 * steepest(before)
+    said = capsys.readouterr().out
+    gains = [
+        float(after) - float(before)
+        for before, after in re.findall(r"([\d.]+) dB before, ([\d.]+) dB after", said)
+    ]
+    assert 0.1 < gains[0] < gains[1] - 0.5
+
+
 def test_every_example_is_on_the_page_with_its_picture():
     named = re.findall(r"\[`(\d\d_\w+\.(?:py|ipynb))`\]\(\1\)", PAGE)
     files = sorted(p.name for p in EXAMPLES.glob("[0-9]*"))
     assert named == files
-    assert len(SCRIPTS) == 9
+    assert len(SCRIPTS) == 10
     for name in files:
         assert f"](pictures/{Path(name).stem}.jpg)" in PAGE
     pictures = list((EXAMPLES / "pictures").glob("*.jpg"))
