@@ -40,11 +40,6 @@ if TYPE_CHECKING:
     from filter_service.camera import PixelGrid
     from filter_service.correcting import Correction
 
-RANGE_LIMITS = (0.0, 2.0)
-CONTRAST_LIMITS = (0.01, 1.0)
-BRIGHTNESS_LIMITS = (0.0, 1.0)
-TOLERANCE_LIMITS = (0.0, 1.0)
-
 
 @with_setting_options()
 def correct_image(
@@ -147,6 +142,13 @@ def correct_image(
     --viewer '{"kind": "prescription", "sphere_dpt": -1}' --target-eye keratoconus
     -o corrected.png
     """
+    from filter_service.correcting.correction import (
+        BRIGHTNESS_LIMITS,
+        CONTRAST_LIMITS,
+        RANGE_LIMITS,
+    )
+    from filter_service.correcting.solver import TOLERANCE_LIMITS
+
     check_range("--pupil-mm", pupil_mm, PUPIL_LIMITS_MM)
     check_range("--focus-dpt", focus_dpt, FOCUS_LIMITS_DPT)
     check_range("--pupil-range-mm", pupil_range_mm, RANGE_LIMITS)

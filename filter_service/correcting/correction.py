@@ -46,8 +46,10 @@ from filter_service.waiting import Wait
 Metric = Literal["retina", "sensitivity"]
 METRICS: tuple[str, ...] = get_args(Metric)
 
-MAX_PUPIL_RANGE_MM, MAX_FOCUS_RANGE_DPT = 2.0, 2.0
-CONTRAST_LIMITS = (0.01, 1.0)
+RANGE_LIMITS = 0.0, 2.0
+"""Limits of the ranges of pupils, mm, and of foci, dpt."""
+
+CONTRAST_LIMITS, BRIGHTNESS_LIMITS = (0.01, 1.0), (0.0, 1.0)
 MIN_DISTANCE_M = 1.0 / MAX_VERGENCE_DPT
 
 Report = Callable[[float, str], None]
@@ -188,6 +190,10 @@ def correct(
     SessionError
         If an eye could not be built.
     """
+    if not isinstance(view, RgbdView):
+        raise BadMessage(
+            f"a {type(view).__name__}", field="view", allowed="an RgbdView"
+        )
     state = State.checked(pupil_diameter_mm, focus_dpt)
     viewers = _as_profiles(viewer)
     _check_choice("metric", metric, METRICS)
@@ -195,9 +201,9 @@ def correct(
     check_number("tolerance", tolerance, TOLERANCE_LIMITS)
     check_number("max_iterations", max_iterations, (1, MAX_ITERATIONS))
     if brightness is not None:
-        check_number("brightness", brightness, (0.0, 1.0))
-    check_number("pupil_range_mm", pupil_range_mm, (0.0, MAX_PUPIL_RANGE_MM))
-    check_number("focus_range_dpt", focus_range_dpt, (0.0, MAX_FOCUS_RANGE_DPT))
+        check_number("brightness", brightness, BRIGHTNESS_LIMITS)
+    check_number("pupil_range_mm", pupil_range_mm, RANGE_LIMITS)
+    check_number("focus_range_dpt", focus_range_dpt, RANGE_LIMITS)
     if display_distance_m is not None:
         check_number(
             "display_distance_m", display_distance_m, (MIN_DISTANCE_M, math.inf)

@@ -15,6 +15,7 @@ an iteration takes one forward and one adjoint call of each operator.
 from __future__ import annotations
 
 import math
+import numbers
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
@@ -341,7 +342,8 @@ def _checked_limits(limits: tuple[float, float]) -> tuple[float, float]:
 def check_number(field: str, value: float, limits: tuple[float, float]) -> None:
     """Raise BadMessage unless a number is within limits."""
     low, high = limits
-    if not low <= value <= high:
+    is_number = isinstance(value, numbers.Real)
+    if not (is_number and low <= value <= high):
         raise BadMessage(
-            f"it is {value!r}", field=field, allowed=f"{low:g} to {high:g}"
+            f"it is {show(value)}", field=field, allowed=f"{low:g} to {high:g}"
         )

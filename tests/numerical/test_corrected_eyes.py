@@ -200,6 +200,8 @@ def test_8_bit_scenes_are_decoded(plain):
 @pytest.mark.parametrize(
     ("change", "said"),
     [
+        ({"view": INFINITE}, r"view: a ndarray \(allowed: an RgbdView\)"),
+        ({"contrast": "half"}, r"contrast: it is 'half' \(allowed: 0.01 to 1\)"),
         ({"contrast": 0.0}, r"contrast: it is 0.0 \(allowed: 0.01 to 1\)"),
         ({"brightness": 1.5}, r"brightness: it is 1.5 \(allowed: 0 to 1\)"),
         ({"metric": "l1"}, r"metric: it is 'l1' \(allowed: retina or sensitivity\)"),
