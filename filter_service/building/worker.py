@@ -85,6 +85,8 @@ def serve_builds(pipe: Connection, build_name: str) -> None:
                 n_parts += 1
                 took_s = time.monotonic() - started_s - rest_s
                 rest_s = REST_RATIO * took_s if n_parts > URGENT_PARTS else 0.0
+                if n_parts == URGENT_PARTS:
+                    trim_heap()  # of the build; the other parts take seconds
                 continue
             n_parts, rest_s = 0, 0.0
             if not requests.has_next(TRIM_AFTER_S):

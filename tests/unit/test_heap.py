@@ -5,6 +5,7 @@ import time
 from multiprocessing import Pipe
 
 import numpy as np
+import pytest
 
 from filter_service.building import worker
 from filter_service.building.jobs import BuildLimits, BuiltStore
@@ -51,23 +52,40 @@ def _build_nothing(job, *, progress, cancelled):
     return BuiltStore(job)
 
 
-def test_the_build_worker_trims_its_heap_once_it_is_idle(monkeypatch):
+@pytest.fixture
+def build_worker(monkeypatch):
+    """Yield the end of the pipe to a worker, and an event that trimming sets."""
     trimmed = threading.Event()
     monkeypatch.setattr(worker, "trim_heap", trimmed.set)
-    monkeypatch.setattr(worker, "TRIM_AFTER_S", 0.01)
+    monkeypatch.setattr(worker, "TRIM_AFTER_S", 60.0)
     monkeypatch.setattr(worker, "_import_function", lambda name: _build_nothing)
     monkeypatch.setattr(worker, "configure_logging", lambda name: None)
     monkeypatch.setattr(worker.signal, "signal", lambda *handler: None)
     ours, theirs = Pipe()
     thread = threading.Thread(target=worker.serve_builds, args=(theirs, ""))
     thread.start()
-    try:
-        assert ours.recv() == ("ready",)
-        assert trimmed.wait(10.0), "what imports have freed"
-        trimmed.clear()
-        ours.send(("build", 1, None))
-        assert ours.recv()[:2] == ("result", 1)
-        assert trimmed.wait(10.0)
-    finally:
-        ours.close()
-        thread.join()
+    assert ours.recv() == ("ready",)
+    yield ours, trimmed
+    ours.close()
+    thread.join()
+
+
+def test_the_build_worker_trims_its_heap_once_it_is_idle(monkeypatch, build_worker):
+    ours, trimmed = build_worker
+    monkeypatch.setattr(worker, "TRIM_AFTER_S", 0.01)
+    ours.send(("build", 1, None))
+    assert ours.recv()[:2] == ("result", 1)
+    assert trimmed.wait(10.0)
+
+
+def test_the_build_worker_trims_its_heap_before_it_plans_ahead(
+    monkeypatch, build_worker
+):
+    ours, trimmed = build_worker
+    count = worker.URGENT_PARTS + 2
+    parts = [("part", 1, k) for k in range(count)]
+    monkeypatch.setattr(worker, "_parts_ahead", lambda *built: iter(parts))
+    ours.send(("build", 1, None))
+    assert ours.recv()[:2] == ("result", 1)
+    assert [ours.recv() for _ in parts] == parts
+    assert trimmed.is_set()
