@@ -249,7 +249,8 @@ static int write_parts(const frame *f, const bin_result *result, const bin_draft
     }
     float *factors = realloc(bin->factors, sizeof *factors * (count + 1));
     if (factors != NULL) bin->factors = factors;
-    bin->weighted = malloc(sizeof *factors * (count + 1));
+    /* Aligned, as loads of pairs across cache lines take twice as long. */
+    bin->weighted = aligned_alloc(32, sizeof *factors * (count + PAIR_FLOATS));
     return bin->weighted != NULL && write_own(result, bin);
 }
 
@@ -407,6 +408,83 @@ INLINE size_t first_pixel(const frame *f, const bin_result *inside, int x0, int 
                   + (size_t)(x0 + inside->left - f->border_px));
 }
 
+/* Pixels of a part that a member lights. */
+typedef struct {
+    int rows;                 /* their number; none if not positive */
+    int first, last;          /* pairs, the last plus one */
+    size_t start;             /* floats of the part before the first row */
+    const uint32_t *texels;   /* of the first row at pair 0, which may be outside the kernel */
+    ptrdiff_t stride;         /* words */
+} footprint;
+
+INLINE footprint footprint_of(const frame *f, const member *one, const level_image *image,
+                              const bin_part *part) {
+    int row = larger_int(one->top, part->top);
+    ptrdiff_t stride = 4 * (ptrdiff_t)row_texels(image);
+    return (footprint){
+        .rows = smaller_int(one->top + image->height, part->bottom) - row,
+        .first = larger_int(one->left, 0) / 2,
+        .last = smaller_int((one->left + image->width + 1) / 2, PAIRS_ACROSS),
+        .start = (size_t)(row - part->top) * PAIRS_ACROSS * PAIR_FLOATS,
+        .texels = f->kernel_texels + 4 * (size_t)image->first_texel + row * stride
+                  + 4 * (ptrdiff_t)one->from,
+        .stride = stride};
+}
+
+/* The compiler generates a loop for each number of pairs: CASE(n), up to PAIRS_ACROSS. */
+#define EACH_WIDTH                                                                           \
+    CASE(1) CASE(2) CASE(3) CASE(4) CASE(5) CASE(6) CASE(7) CASE(8) CASE(9) CASE(10)         \
+    CASE(11) CASE(12) CASE(13) CASE(14) CASE(15) CASE(16)
+
+/* Weights of a kernel at a pair of pixels, in steps. */
+INLINE f32x8 weight_of(const uint32_t *texels, i32x8 factors) {
+    return __builtin_convertvector(pair_sums(read_pairs(texels), factors), f32x8);
+}
+
+/* Adds a color to rows of `pairs` adjacent pairs of pixels, times the weights of a kernel. */
+INLINE void scatter_columns(const uint32_t *texels, ptrdiff_t stride, float *light, int rows,
+                            i32x8 factors, f32x8 color, int pairs) {
+    for (int row = 0; row < rows; ++row) {
+        for (int p = 0; p < pairs; ++p) {
+            float *to = light + PAIR_FLOATS * p;
+            store8(to, load8(to) + weight_of(texels + 8 * p, factors) * color);
+        }
+        texels += stride;
+        light += PAIRS_ACROSS * PAIR_FLOATS;
+    }
+}
+
+/* Adds the light of a member to a part.  In contrast to add_columns, no pairs beyond the
+ * kernel are processed: without coverage, this is faster. */
+INLINE void scatter_member(const frame *f, const member *one, const level_image *image,
+                           const bin_part *part, float *light) {
+    footprint own = footprint_of(f, one, image, part);
+    if (own.rows <= 0 || own.first >= own.last) return;
+    light += own.start;
+    i32x8 factors = all_ints8(one->factors);
+    f32x8 color = twice4(one->color);
+    const uint32_t *from = own.texels + 8 * own.first;
+    light += PAIR_FLOATS * own.first;
+#define CASE(n) \
+    case n: scatter_columns(from, own.stride, light, own.rows, factors, color, n); break;
+    switch (own.last - own.first) { EACH_WIDTH default: break; }
+#undef CASE
+}
+
+/* Adds the light of a part's clusters to its rows. */
+static void scatter_part(const frame *f, const bin_plan *bin, const bin_part *part, int x0,
+                         int y0, float *light) {
+    raster window_of = {.x0 = x0, .y0 = y0};
+    for (int i = part->first; i < part->end; ++i) {
+        const cluster *own = f->clusters + bin->clusters[i];
+        const level_image *image = image_of(f, own->state);
+        members all;          /* is not cleared */
+        list_members(f, own, part->group, image, &window_of, &all);
+        for (const member *one = all.of; one < all.of + all.count; ++one)
+            scatter_member(f, one, image, part, light);
+    }
+}
+
 /* Item: one bin of the image. */
 static void apply_bin(void *argument, int item, int thread) {
     (void)thread;
@@ -416,23 +494,16 @@ static void apply_bin(void *argument, int item, int thread) {
     int x0 = item % job->plan->columns * BIN_WIDTH, y0 = item / job->plan->columns * BIN_HEIGHT;
     bin_result inside = inside_of(f, x0, y0);
     if (inside.left >= inside.right || inside.top >= inside.bottom) return;
-    bin_sums s;
-    window w = open_window(x0, y0, &s);
     float sums[BIN_HEIGHT * PAIRS_ACROSS * PAIR_FLOATS] = {0};
-    raster *open = w.open.sizes;
+    _Alignas(32) float light[BIN_HEIGHT * PAIRS_ACROSS * PAIR_FLOATS];
     for (const bin_part *part = bin->parts; part < bin->parts + bin->part_count; ++part) {
-        for (int i = part->first; i < part->end; ++i)
-            add_light(f, bin->clusters[i], part->group, &w.open);
-        int top = larger_int(part->top, open->top);
-        int bottom = smaller_int(part->bottom, open->bottom);
+        size_t count = (size_t)(part->bottom - part->top) * PAIRS_ACROSS * PAIR_FLOATS;
         const float *factors = bin->factors + part->first_factor;
-        factors += (top - part->top) * PAIRS_ACROSS * PAIR_FLOATS;
-        for (int i = top * PAIRS_ACROSS; i < bottom * PAIRS_ACROSS; ++i) {
-            float *sum = sums + i * PAIR_FLOATS;
-            store8(sum, load8(sum) + load8(factors) * open->pairs[i].light);
-            factors += PAIR_FLOATS;
-        }
-        darken_raster(open);
+        float *sum = sums + part->top * PAIRS_ACROSS * PAIR_FLOATS;
+        memset(light, 0, count * sizeof *light);
+        scatter_part(f, bin, part, x0, y0, light);
+        for (size_t i = 0; i < count; i += PAIR_FLOATS)
+            store8(sum + i, load8(sum + i) + load8(factors + i) * load8(light + i));
     }
     for (int y = inside.top; y < inside.bottom; ++y) {
         size_t first = first_pixel(f, &inside, x0, y0, y);
@@ -485,54 +556,40 @@ static void weigh_bin(void *argument, int item, int thread) {
 /* Sums rows of `pairs` adjacent pairs of pixels, times the weights of a kernel. */
 INLINE f32x8 gather_columns(const uint32_t *texels, ptrdiff_t stride, const float *weighted,
                             int rows, i32x8 factors, int pairs) {
-    /* Two rows at a time if there are few pairs: additions wait for those before them. */
-    int ways = pairs <= 2 ? 2 : 1, row = 0;
-    f32x8 sums[2 * COLUMN_PAIRS];
-    for (int n = 0; n < ways * pairs; ++n) sums[n] = all8(0.0f);
-    for (; row + ways <= rows; row += ways)
-        for (int way = 0; way < ways; ++way) {
-            for (int p = 0; p < pairs; ++p) {
-                f32x8 weight = __builtin_convertvector(
-                    pair_sums(read_pairs(texels + 8 * p), factors), f32x8);
-                sums[way * pairs + p] += weight * load8(weighted + PAIR_FLOATS * p);
-            }
+    /* Several sums, because additions wait for those before them. */
+    f32x8 sums[4] = {all8(0.0f), all8(0.0f), all8(0.0f), all8(0.0f)};
+    int row = 0;
+    for (int step = pairs > 2 ? 1 : 2; row + step <= rows; row += step)
+        for (int n = 0; n < step; ++n) {
+            for (int p = 0; p < pairs; ++p)
+                sums[(n * pairs + p) % 4] += weight_of(texels + 8 * p, factors)
+                                             * load8(weighted + PAIR_FLOATS * p);
             texels += stride;
             weighted += PAIRS_ACROSS * PAIR_FLOATS;
         }
     if (row < rows)
-        for (int p = 0; p < pairs; ++p) {
-            f32x8 weight = __builtin_convertvector(
-                pair_sums(read_pairs(texels + 8 * p), factors), f32x8);
-            sums[p] += weight * load8(weighted + PAIR_FLOATS * p);
-        }
-    for (int n = 1; n < ways * pairs; ++n) sums[0] += sums[n];
+        for (int p = 0; p < pairs; ++p)
+            sums[p % 4] += weight_of(texels + 8 * p, factors) * load8(weighted + PAIR_FLOATS * p);
+    sums[0] += sums[1];
+    sums[2] += sums[3];
+    sums[0] += sums[2];
     return sums[0];
 }
 
 /* Returns the light of a part that a member receives, of each color. */
 INLINE f32x4 gather_member(const frame *f, const member *one, const level_image *image,
                            const bin_part *part, const float *weighted) {
-    int row = larger_int(one->top, part->top);
-    int rows = smaller_int(one->top + image->height, part->bottom) - row;
-    int pair = larger_int(one->left, 0) / 2;
-    int last = smaller_int((one->left + image->width + 1) / 2, PAIRS_ACROSS);
+    footprint own = footprint_of(f, one, image, part);
     f32x8 sum = all8(0.0f);
-    if (rows <= 0 || pair >= last) return all4(0.0f);
-    ptrdiff_t stride = 4 * (ptrdiff_t)row_texels(image);
-    const uint32_t *texels = f->kernel_texels + 4 * (size_t)image->first_texel + row * stride
-                             + 4 * (ptrdiff_t)one->from;
-    weighted += (row - part->top) * PAIRS_ACROSS * PAIR_FLOATS;
+    if (own.rows <= 0 || own.first >= own.last) return all4(0.0f);
+    weighted += own.start;
     i32x8 factors = all_ints8(one->factors);
-    int columns = (last - pair + COLUMN_PAIRS - 1) / COLUMN_PAIRS;
-    for (int pairs; pair < last; pair += pairs, --columns) {
-        pairs = (last - pair + columns - 1) / columns;
-        const uint32_t *from = texels + 8 * pair;
-        const float *own = weighted + PAIR_FLOATS * pair;
+    const uint32_t *from = own.texels + 8 * own.first;
+    weighted += PAIR_FLOATS * own.first;
 #define CASE(n) \
-    case n: sum += gather_columns(from, stride, own, rows, factors, n); break;
-        switch (pairs) { CASE(1) CASE(2) CASE(3) CASE(4) default: break; }
+    case n: sum = gather_columns(from, own.stride, weighted, own.rows, factors, n); break;
+    switch (own.last - own.first) { EACH_WIDTH default: break; }
 #undef CASE
-    }
     f32x4 low = {sum[0], sum[1], sum[2], sum[3]}, high = {sum[4], sum[5], sum[6], sum[7]};
     return (low + high) * one->color;
 }

@@ -1,0 +1,160 @@
+"""The linear operator of a frame and its adjoint: time beside error.
+
+    python -m tests.benchmarks.bench_operator [--quick] [--json]
+
+The courtyard at 480x270 and 1280x720 through six eyes, in a constant state.  The frame
+without merging, the operator and its adjoint take turns, after the first call of each.
+The error of the operator is its largest difference from the frame, relative to the
+brightest pixel; that of the adjoint is the difference of <A x, y> and <x, A' y>,
+relative to them, for random x and y from 0 to 1.  Below, the times of processors (all
+threads) and the ratios of medians.  Writes results/operator.json.
+"""
+
+import argparse
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimator.profiles.parse import parse_profile
+from filter_service.filtering.operator import ViewOperator, operator_options
+from filter_service.psfs.eye_for_spec import eye_for_spec
+from filter_service.psfs.store import build_psf_store
+from filter_service.rendering.engine import ViewRequest
+from filter_service.rendering.media_effects import linear_from_srgb
+from filter_service.rendering.native import NativeRenderer
+from filter_service.rgbd_view import RgbdView
+from filter_service.view_state import State
+from tests.benchmarks.harness import WARM_UPS, Row, memory_mb, publish
+from tests.benchmarks.published_figures import CONDITIONS
+from tests.grid_specs import grid_spec
+from tests.numerical.scene_frames import scene_view
+
+SIZES, QUICK_SIZES = ((480, 270), (1280, 720)), ((240, 135),)
+COUNTS, QUICK_COUNT = (30, 12), 5
+STATE = State(4.5, 0.5)
+METHODS = ("frame", "forward", "adjoint")
+
+
+def linear_view(size_px: tuple[int, int]) -> RgbdView:
+    """Return the courtyard in linear light."""
+    view = scene_view("courtyard", width_px=size_px[0], height_px=size_px[1])
+    return replace(view, color=linear_from_srgb(view.color).astype(np.float32))
+
+
+def inner(first: NDArray, second: NDArray) -> float:
+    """Return the inner product in float64."""
+    return float(np.vdot(first.astype(float), second.astype(float)))
+
+
+def times_in_turns(
+    calls: dict[str, Callable[[], object]], count: int
+) -> dict[str, NDArray[np.float64]]:
+    """Return wall and processor times (count, 2), ms, of calls that take turns."""
+    found: dict[str, list[tuple[float, float]]] = {name: [] for name in calls}
+    for k in range(WARM_UPS + count):
+        for name, call in calls.items():
+            wall_s, own_s = time.perf_counter(), time.process_time()
+            call()
+            elapsed_s = time.perf_counter() - wall_s, time.process_time() - own_s
+            if k >= WARM_UPS:
+                found[name].append(elapsed_s)
+    return {name: 1e3 * np.array(values) for name, values in found.items()}
+
+
+def rows_of(
+    view: RgbdView, name: str, count: int, ratios: list[dict[str, object]]
+) -> Iterator[Row]:
+    """Rows of one eye; appends the ratios of its times."""
+    profile = parse_profile({"kind": "preset", "name": name})
+    spec = grid_spec(view.camera, mode="dynamic")
+    eye, _ = eye_for_spec(profile, spec)
+    engine = NativeRenderer()
+    handle = engine.load(build_psf_store(eye, spec))
+    request = ViewRequest(view, handle, STATE, options=operator_options(1.0))
+    operator = ViewOperator.of(request, None)
+    rng = np.random.default_rng(0)
+    x, y = rng.random((2, *operator.color_shape), dtype=np.float32)
+    found: dict[str, NDArray] = {}
+
+    def frame() -> None:
+        found["frame"] = engine.begin(request)().color
+
+    def forward() -> None:
+        found["forward"] = operator.forward(view.color)
+
+    def adjoint() -> None:
+        found["adjoint"] = operator.adjoint(y)
+
+    calls = dict(zip(METHODS, (frame, forward, adjoint), strict=True))
+    times_ms = times_in_turns(calls, count)
+    engine.close()
+    product = inner(operator.forward(x), y)
+    difference = np.abs(found["forward"] - found["frame"]).max()
+    errors = {
+        "frame": ("none", 0.0, "itself"),
+        "forward": (
+            "largest difference over brightest",
+            float(difference / found["frame"].max()),
+            "the frame",
+        ),
+        "adjoint": (
+            "<x, A' y> over <A x, y>, less 1",
+            abs(inner(x, found["adjoint"]) / product - 1.0),
+            "the operator",
+        ),
+    }
+    setting = f"{view.width_px}x{view.height_px}"
+    for method in METHODS:
+        wall_ms = times_ms[method][:, 0]
+        yield Row(
+            *("operator", method, name, setting, count),
+            *(float(np.median(wall_ms)), float(np.percentile(wall_ms, 95))),
+            *(memory_mb(), *errors[method]),
+        )
+    middle = {method: np.median(times_ms[method], axis=0) for method in METHODS}
+    ratio, adjoint_ratio = (
+        middle["forward"] / middle["frame"],
+        middle["adjoint"] / middle["forward"],
+    )
+    ratios.append(
+        {
+            "case": name,
+            "setting": setting,
+            **{f"{m}_cpu_ms": round(float(middle[m][1]), 2) for m in METHODS},
+            "forward_over_frame": round(float(ratio[0]), 3),
+            "forward_over_frame_cpu": round(float(ratio[1]), 3),
+            "adjoint_over_forward": round(float(adjoint_ratio[0]), 3),
+            "adjoint_over_forward_cpu": round(float(adjoint_ratio[1]), 3),
+        }
+    )
+
+
+def main() -> None:
+    """Run from the command line."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--quick", action="store_true", help="240x135, one eye")
+    parser.add_argument("--json", action="store_true", help="print the report alone")
+    options = parser.parse_args()
+    sizes, counts, eyes = SIZES, COUNTS, CONDITIONS
+    if options.quick:
+        sizes, counts, eyes = QUICK_SIZES, (QUICK_COUNT,), CONDITIONS[:1]
+    rows: list[Row] = []
+    ratios: list[dict[str, object]] = []
+    for size_px, count in zip(sizes, counts, strict=True):
+        view = linear_view(size_px)
+        for name in eyes:
+            rows += rows_of(view, name, count, ratios)
+    publish(
+        "operator",
+        rows,
+        as_json=options.json,
+        is_whole=not options.quick,
+        details={"ratios": ratios},
+    )
+
+
+if __name__ == "__main__":
+    main()
