@@ -60,6 +60,9 @@ PUPILS_MM = 3.0, 4.0
 CONTRASTS = 1.0, 0.5
 PUPIL_RANGE_MM, FOCUS_RANGE_DPT = 0.5, 0.25
 SMALL, SMALL_FOV_DEG = (240, 135), 4.5
+SHOWN_BUDGETS = (1.0, None), (0.3, 0.5)
+"""Contrasts and brightnesses of what another eye sees."""
+
 WIDE_FOV_DEG = 30.0
 LARGE, LARGE_FOV_DEG = (480, 270), 9.0
 GOAL = 0.01
@@ -208,24 +211,30 @@ def shown_rows(builder):
     far_m = np.full(LARGE[::-1], np.inf, np.float32)
     with ExitStack() as closing:
         viewer = Viewer(closing, builder, VIEWERS["-1 dpt"], camera).operator(4.0)
-    for (name, target_eye), picture in product(TARGETS.items(), PICTURES):
+    for (name, target_eye), picture, (contrast, brightness) in product(
+        TARGETS.items(), PICTURES, SHOWN_BUDGETS
+    ):
         image = PICTURES[picture](LARGE)
+        plain = compressed(image, contrast=contrast, brightness=brightness)
         found = correct(
             RgbdView(image, far_m, camera.tangents),
             VIEWERS["-1 dpt"],
             target_eye=target_eye,
             pupil_diameter_mm=4.0,
             focus_dpt=0.0,
+            contrast=contrast,
+            brightness=brightness,
             builder=builder,
         )
         bound_db = -10.0 * np.log10(max(found.lower_bound, 1e-30))
+        setting = f"{picture}, contrast {contrast:g}"
         for method, psnr, seconds in (
-            ("scene displayed", psnr_db([viewer.forward(image)], found.target), 0.0),
+            ("scene displayed", psnr_db([viewer.forward(plain)], found.target), 0.0),
             ("target displayed", found.psnr_before_db, 0.0),
             ("solved", found.psnr_after_db, found.solve_s),
         ):
             yield Row(
-                *("correct", method, f"-1 dpt sees {name}", picture, 1),
+                *("correct", method, f"-1 dpt sees {name}", setting, 1),
                 *(1e3 * seconds, 1e3 * seconds, memory_mb(), "retinal psnr_db", psnr),
                 f"what the eye sees; no picture is above {bound_db:.1f} dB",
             )
