@@ -28,6 +28,7 @@ axis is the relaxed eye's, but for tilt.
 """
 
 from dataclasses import replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -86,7 +87,6 @@ class PeripheralResidual:
         nodes_deg: FieldNodes,
     ):
         self.change = change
-        self._known_um: dict[tuple[bytes, bytes], NDArray[np.float64]] = {}
         usual = clamped_eye(change, eye)
         self._traced = _traced(usual, *nodes_deg)
         self._depth_mm = usual.accommodating.entrance_pupil_mm
@@ -116,8 +116,13 @@ class PeripheralResidual:
         return found_um
 
     def __getstate__(self) -> dict[str, Any]:
-        """Pickle without known phases, which take a megabyte."""
-        return vars(self) | {"_known_um": {}}
+        """Return the state without known phases, which take a megabyte."""
+        return {name: v for name, v in vars(self).items() if name != "_known_um"}
+
+    @cached_property
+    def _known_um(self) -> dict[tuple[bytes, bytes], NDArray[np.float64]]:
+        """Phases of the last arrays of fields; files of eyes do not contain them."""
+        return {}
 
     def _difference_um(
         self, traced: FieldInterpolation, h_deg: NDArray[Any], v_deg: NDArray[Any]
