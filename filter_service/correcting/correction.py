@@ -166,7 +166,8 @@ def correct(
         Differences on the retina count alike, or by neural contrast sensitivity.
     pupil_range_mm, focus_range_dpt : float, 0 to 2
         Solve for the mean error over the given state, and pupil and focus this much
-        larger and smaller.
+        larger and smaller.  An error of focus is modeled as one of the distance of the
+        display; farther than infinity, as a nearer focus, if the eye can accommodate.
     tolerance : float
         Remaining error at which the solver stops, see `nearest_picture`.
     max_iterations : int

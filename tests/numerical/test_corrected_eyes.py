@@ -158,6 +158,15 @@ def test_the_error_over_a_range_of_states_is_the_mean_over_them(plain):
     assert error(found.color) < error(plain.color)
 
 
+def test_an_error_of_focus_is_one_of_the_distance_of_a_near_display():
+    found = solve(scene(), display_distance_m=2.0, focus_range_dpt=0.25)
+    squares = []
+    for distance_m in (2.0, 4.0 / 3.0, 4.0):
+        view = replace(scene(), depth_m=np.full_like(INFINITE, distance_m))
+        squares.append(rms(seen(VIEWER, view, found.color) - found.target) ** 2)
+    assert np.isclose(np.mean(squares), min(found.errors), rtol=0.02)
+
+
 def test_both_eyes_look_at_the_same_picture(plain):
     both = solve(scene(), VIEWER, OTHER)
     errors = [
