@@ -75,6 +75,7 @@ def _api_page() -> str:
             if is_code and not inspect.getdoc(found):
                 raise PluginError(f"{package}.{name} has no docstring")
             lines += [f"::: ocufilter.{name}", ""]
+    lines += ["## Differentiate in PyTorch", "", "::: ocufilter.torch.SeeThrough", ""]
     return "\n".join(lines)
 
 

@@ -17,6 +17,7 @@ The packages `filter_service`, `clients` and `estimator` define these names, whi
 can also be imported from there.
 
     __main__  the command line, as ``python -m ocufilter``
+    torch     an eye as a layer of PyTorch; requires the extra ``ocufilter[torch]``
 """
 
 from importlib import import_module

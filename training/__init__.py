@@ -1,1 +1,1 @@
-"""Training of the networks; the only package that imports torch."""
+"""Training of the networks, with torch, which the service never imports."""

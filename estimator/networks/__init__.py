@@ -1,4 +1,4 @@
-"""Inference with the trained networks; only `training` requires PyTorch.
+"""Inference with the trained networks, without PyTorch; `training` trains them.
 
 inference  cards of the networks, loading and evaluation, by ONNX Runtime
 weights/   cards and ONNX files, written by `python -m training.export`

@@ -1,9 +1,8 @@
 """The adapters of the examples, with doubles of PsychoPy and of a camera's driver.
 
-PyTorch itself is in the tests of the training.
+The one for PyTorch is in the tests of the training.
 """
 
-import multiprocessing
 import runpy
 import sys
 from types import ModuleType, SimpleNamespace
@@ -12,13 +11,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from filter_service import Camera, EyeFilter, FilterSettings
 from tests.source_tree import ROOT
 
 ADAPTERS = ROOT / "examples" / "adapters"
 SIDE_PX = 48
-SETTINGS = FilterSettings(mode="on-axis", eye_model="wavefront")
-STATE = {"pupil_diameter_mm": 4.0, "focus_dpt": 0.0}
 
 
 @pytest.fixture
@@ -29,61 +25,6 @@ def color(rng):
 @pytest.fixture(autouse=True)
 def adapters(monkeypatch):
     monkeypatch.syspath_prepend(str(ADAPTERS))
-
-
-def expected(color, depth_m=2.0, **state):
-    camera = Camera.from_fov(10.0, width_px=SIDE_PX, height_px=SIDE_PX)
-    depth_m = np.broadcast_to(np.float32(depth_m), color.shape[:2]).copy()
-    with EyeFilter("myopia", camera, SETTINGS) as eye:
-        return eye.filter(color, depth_m, **{**STATE, **state}, whole=True).color
-
-
-@pytest.fixture(scope="module", autouse=True)
-def first_picture():
-    """Open a filter; before, the process loads what all filters use."""
-    expected(np.zeros((SIDE_PX, SIDE_PX, 3), np.uint8))
-
-
-def transform(**more):
-    from ocufilter_torch import SeenThrough
-
-    angle = {"vertical_fov_deg": 10.0, "distance_m": 2.0}
-    return SeenThrough("myopia", **angle, settings=SETTINGS, **more)
-
-
-def test_a_transform_takes_arrays_and_pillows_pictures(color):
-    seen, wanted = transform(), expected(color)
-    np.testing.assert_array_equal(seen(color), wanted)
-    picture = seen(Image.fromarray(color))
-    assert isinstance(picture, Image.Image)
-    np.testing.assert_array_equal(np.asarray(picture), wanted)
-    depth_m = np.linspace(0.3, 2.0, color.shape[0])[:, None] + 0.0 * color[..., 0]
-    np.testing.assert_array_equal(
-        seen((color, depth_m)), expected(color, depth_m.astype(np.float32))
-    )
-
-
-def test_a_transform_needs_no_settings(color):
-    from ocufilter_torch import SeenThrough
-
-    usual = SeenThrough("myopia", vertical_fov_deg=20.0, distance_m=2.0)
-    assert usual(color).shape == color.shape
-
-
-def test_a_transform_takes_floats_as_srgb(color):
-    seen = transform()(color.astype(np.float32) / 255.0)
-    assert seen.dtype == np.float32
-    assert np.abs(255.0 * seen - expected(color)).max() < 0.51 + 1e-3
-
-
-@pytest.mark.clients
-def test_a_transform_goes_to_other_processes(color):
-    seen = transform()
-    seen(color)
-    for method in ("fork", "spawn"):
-        with multiprocessing.get_context(method).Pool(1) as pool:
-            (found,) = pool.map(seen, [color])
-        np.testing.assert_array_equal(found, expected(color))
 
 
 class ImageStim:

@@ -24,7 +24,10 @@ USER_EXTRAS = (
         "metrics",
     ),
 )
-"""Extras for users; all others are for developers."""
+"""Extras for users; all others are for developers.
+
+Not `torch`: users choose its build, with up to 5 GB of other packages for CUDA.
+"""
 
 
 def project() -> dict[str, Any]:

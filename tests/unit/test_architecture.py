@@ -122,7 +122,7 @@ KNOW_MESSAGES = ("service", "wire")
 
 HOME = {
     # library: files that may import it, each with its reason
-    "torch": ("training/*",),  # the service must run without it
+    "torch": ("training/*", "ocufilter/torch.py"),  # never in the service
     "onnx": ("training/*",),
     "onnxruntime": (
         "estimator/networks/inference.py",
@@ -416,6 +416,13 @@ def test_the_client_library_loads_neither_opengl_nor_the_eye_model():
         [sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True
     )
     assert finished.returncode == 0, finished.stderr
+
+
+def test_without_torch_its_layer_names_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "torch", None)
+    monkeypatch.delitem(sys.modules, "ocufilter.torch", raising=False)
+    with pytest.raises(ModuleNotFoundError, match=r"pip install 'ocufilter\[torch\]'"):
+        importlib.import_module("ocufilter.torch")
 
 
 def test_the_rules_catch_a_wrong_import(tmp_path, monkeypatch):
