@@ -208,6 +208,8 @@ class Builder:
             Longest time to wait for the first event.
         """
         self.free_retired(stream)
+        if not timeout_s and stream.events.empty():
+            return
         with suppress(queue.Empty):
             while True:
                 event = stream.events.get(timeout=timeout_s)
