@@ -46,3 +46,8 @@ def test_memory_of_frames_that_differ_is_kept():
     for k in range(2 * TRIM_INTERVAL):
         use(arrays, (LARGE, SMALL)[k % 2])
     assert arrays.memory_mb == pytest.approx(LARGE / 1e6, rel=0.01)
+
+
+def test_an_array_that_does_not_fit_is_an_error_of_memory():
+    with pytest.raises(MemoryError, match="MB for a buffer of frames"):
+        Arrays().address("texels", 2**60, np.uint8)

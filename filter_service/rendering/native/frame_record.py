@@ -302,8 +302,18 @@ class _Buffer:
 
     @classmethod
     def of(cls, n_bytes: int, *, is_dense: bool) -> _Buffer:
-        """Return a buffer whose pages take memory once they are written to."""
-        memory = mmap.mmap(-1, n_bytes, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
+        """Return a buffer whose pages take memory once they are written to.
+
+        Raises
+        ------
+        MemoryError
+        """
+        try:
+            memory = mmap.mmap(-1, n_bytes, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
+        except OSError as error:
+            raise MemoryError(
+                f"{n_bytes / 1e6:.0f} MB for a buffer of frames: {error.strerror}"
+            ) from None
         if is_dense and n_bytes >= HUGE_PAGES_FROM_BYTES:
             with suppress(OSError, AttributeError):  # unknown to this system
                 memory.madvise(mmap.MADV_HUGEPAGE)
