@@ -14,8 +14,8 @@ from filter_service.correcting import (
 )
 from filter_service.errors import BadMessage
 
-SHAPE = (5, 6, 3)
-N_VALUES = 90
+SHAPE = (4, 5, 3)
+N_VALUES = 60
 
 
 class Dense:
@@ -78,8 +78,8 @@ def test_the_picture_is_that_of_another_solver(rng, limits):
 
 
 def test_the_least_mean_over_operators_of_different_sizes(rng):
-    shape = (2, 6, 3)
-    first, second = blurring_matrix(rng), blurring_matrix(rng)[:36]
+    shape = (2, 5, 3)
+    first, second = blurring_matrix(rng), blurring_matrix(rng)[:30]
     targets = rng.random(SHAPE), rng.random(shape)
     stacked = np.concatenate([target.ravel() for target in targets])
     least, _ = least_error(np.concatenate([first, second]), stacked)
@@ -165,7 +165,7 @@ def test_momentum_that_points_uphill_is_dropped(defocus, squares):
 
 
 def test_differences_are_weighted(rng):
-    camera = Camera.from_fov(1.0, width_px=6, height_px=5)
+    camera = Camera.from_fov(1.0, width_px=5, height_px=4)
     weight, matrix = SensitivityWeight(camera), blurring_matrix(rng)
     target = rng.random(SHAPE)
     filters = np.stack(
@@ -206,10 +206,10 @@ def test_a_grating_is_weighted_by_the_neural_sensitivity(rng, across, along):
         ({"operators": []}, r"targets: there are 1 for 0 operators \(allowed: one for"),
         ({"targets": []}, r"targets: there are 0 for 1 operators \(allowed: one for"),
         ({"targets": [np.zeros((2, 3))]}, r"targets\[0\]: it has shape \(2, 3\) "),
-        ({"targets": [np.full(SHAPE, np.nan)]}, r"targets\[0\]: 90 values are not fin"),
+        ({"targets": [np.full(SHAPE, np.nan)]}, r"targets\[0\]: 60 values are not fin"),
         (
             {"start": np.zeros(3)},
-            r"start: it has shape \(3,\) \(allowed: \(5, ",
+            r"start: it has shape \(3,\) \(allowed: \(4, ",
         ),
         (
             {"limits": (1.0, 0.0)},
@@ -227,7 +227,7 @@ def test_bad_input_is_named(change, said):
 
 
 def test_operators_take_the_same_pictures():
-    operators = Dense(np.eye(N_VALUES)), Dense(np.eye(N_VALUES), color_shape=(6, 5, 3))
+    operators = Dense(np.eye(N_VALUES)), Dense(np.eye(N_VALUES), color_shape=(5, 4, 3))
     with pytest.raises(BadMessage, match="operators: their pictures have shapes"):
         nearest_picture(operators, [np.zeros(SHAPE)] * 2)
 
