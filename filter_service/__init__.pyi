@@ -10,6 +10,7 @@ from .errors import BadMessage as BadMessage
 from .errors import FilterError as FilterError
 from .filter_protocol import Filter as Filter
 from .filter_protocol import FilteredImages as FilteredImages
+from .filtering.derivatives import image_derivatives as image_derivatives
 from .filtering.eye_filter import EyeFilter as EyeFilter
 from .filtering.operator import FilterOperator as FilterOperator
 from .filtering.planned_frame import Filtered as Filtered

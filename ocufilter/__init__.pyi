@@ -90,6 +90,7 @@ from filter_service import ViewState as ViewState
 from filter_service import as_views as as_views
 from filter_service import correct as correct
 from filter_service import errors as errors
+from filter_service import image_derivatives as image_derivatives
 from filter_service import is_software_renderer as is_software_renderer
 from filter_service import nearest_picture as nearest_picture
 from filter_service import plan_views as plan_views

@@ -20,7 +20,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse.linalg import lsqr
 
-from filter_service import Camera, EyeFilter, FilterOperator, FilterSettings, RgbdView
+from filter_service import (
+    Camera,
+    EyeFilter,
+    FilterOperator,
+    FilterSettings,
+    RgbdView,
+    image_derivatives,
+)
 
 try:
     import torch
@@ -30,6 +37,10 @@ except ModuleNotFoundError as error:
         "pip install 'ocufilter[torch]'",
         name="torch",
     ) from error
+
+
+STATE = ("pupil_diameter_mm", "focus_dpt")
+"""Parameters of the state that may be tensors with gradients."""
 
 
 class SeeThrough(torch.nn.Module):
@@ -56,8 +67,10 @@ class SeeThrough(torch.nn.Module):
     depth_m : (height, width) float32, RgbdView, or sequence of RgbdView
         Depth, as for `EyeFilter.operator`.  Assign another array to the attribute of
         the same name to filter another scene.
-    pupil_diameter_mm, focus_dpt : float
-        State of the eye; other values may be assigned to the attributes.
+    pupil_diameter_mm, focus_dpt : float or scalar tensor
+        State of the eye; other values may be assigned to the attributes.  Tensors that
+        require gradients, such as parameters, get those of `image_derivatives`, which
+        take seconds and cannot be differentiated again.
     gaze_deg : (h, v), optional
     settings : FilterSettings or mapping, optional
         Settings of the filter.
@@ -76,8 +89,8 @@ class SeeThrough(torch.nn.Module):
         camera: Camera,
         depth_m: NDArray[Any] | RgbdView | Sequence[RgbdView],
         *,
-        pupil_diameter_mm: float,
-        focus_dpt: float,
+        pupil_diameter_mm: float | torch.Tensor,
+        focus_dpt: float | torch.Tensor,
         gaze_deg: tuple[float, float] | None = None,
         settings: FilterSettings | Mapping[str, Any] = FilterSettings(),  # noqa: B008
         render_tolerance: float = 1.0,
@@ -103,7 +116,12 @@ class SeeThrough(torch.nn.Module):
         ValueError
             If the tensor has another shape, or is not real and floating-point.
         """
-        return _Applied.apply(color, self.operator(), False)
+        state = self.pupil_diameter_mm, self.focus_dpt
+        image = _Applied.apply(color, self.operator(), False)
+        if any(isinstance(value, torch.Tensor) for value in state):
+            values = [torch.as_tensor(value) for value in state]
+            return _OfState.apply(image, color, self, *values)
+        return image
 
     def A_adjoint(self, image: torch.Tensor) -> torch.Tensor:  # noqa: N802
         """Return the transpose of the operator, applied to images.
@@ -153,12 +171,10 @@ class SeeThrough(torch.nn.Module):
         BadMessage
             As `EyeFilter.operator`.
         """
-        if self._pid != os.getpid():  # threads do not survive a fork
-            self._forget()
-            self._pid = os.getpid()
+        eye_filter = self._opened()
         state: dict[str, Any] = {
-            "pupil_diameter_mm": float(self.pupil_diameter_mm),
-            "focus_dpt": float(self.focus_dpt),
+            "pupil_diameter_mm": _number(self.pupil_diameter_mm),
+            "focus_dpt": _number(self.focus_dpt),
             "gaze_deg": self.gaze_deg,
             "render_tolerance": self.render_tolerance,
         }
@@ -166,11 +182,43 @@ class SeeThrough(torch.nn.Module):
         if made is not None and made[0] is self.depth_m and made[1] == state:
             return made[2]
         self._made = None  # its memory goes first
-        if self._filter is None:
-            self._filter = EyeFilter(self.profile, self.camera, self.settings)
-        found = self._filter.operator(self.depth_m, **state)
+        found = eye_filter.operator(self.depth_m, **state)
         self._made = self.depth_m, state, found
         return found
+
+    def _derivatives(
+        self,
+        color: torch.Tensor,
+        names: list[str],
+        depth_m: Any,
+        pupil_diameter_mm: float,
+        focus_dpt: float,
+    ) -> dict[str, torch.Tensor]:
+        """Return the derivatives of images by pupil or focus."""
+        if not names:
+            return {}
+        arrays = color.detach().to("cpu", torch.float32).movedim(-3, -1).numpy()
+        found = image_derivatives(
+            self._opened(),
+            np.ascontiguousarray(arrays),
+            depth_m,
+            names,
+            pupil_diameter_mm=pupil_diameter_mm,
+            focus_dpt=focus_dpt,
+            gaze_deg=self.gaze_deg,
+        )
+        return {
+            name: torch.from_numpy(image).movedim(-1, -3)
+            for name, image in found.items()
+        }
+
+    def _opened(self) -> EyeFilter:
+        if self._pid != os.getpid():  # threads do not survive a fork
+            self._forget()
+            self._pid = os.getpid()
+        if self._filter is None:
+            self._filter = EyeFilter(self.profile, self.camera, self.settings)
+        return self._filter
 
     def close(self) -> None:
         """Release the filter's resources; the next use opens another filter."""
@@ -184,6 +232,44 @@ class SeeThrough(torch.nn.Module):
     def __getstate__(self) -> dict[str, Any]:
         """Return the state to pickle, without the filter and the operator."""
         return {**self.__dict__, "_filter": None, "_made": None, "_pid": 0}
+
+
+def _number(value: float | torch.Tensor) -> float:
+    return float(value.item() if isinstance(value, torch.Tensor) else value)
+
+
+class _OfState(torch.autograd.Function):
+    """The images as functions of pupil and focus, besides their colors."""
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        image: torch.Tensor,
+        color: torch.Tensor,
+        see: SeeThrough,
+        *state: torch.Tensor,
+    ) -> torch.Tensor:
+        ctx.see, ctx.state = see, [value.item() for value in state]
+        ctx.depth_m = see.depth_m
+        ctx.save_for_backward(color)
+        return image.clone()
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, gradient: torch.Tensor) -> tuple[Any, ...]:
+        needed = [
+            name
+            for name, is_needed in zip(STATE, ctx.needs_input_grad[3:], strict=True)
+            if is_needed
+        ]
+        found = ctx.see._derivatives(
+            ctx.saved_tensors[0], needed, ctx.depth_m, *ctx.state
+        )
+        by_state = [
+            (found[name].to(gradient) * gradient).sum() if name in found else None
+            for name in STATE
+        ]
+        return gradient, None, None, *by_state
 
 
 class _Applied(torch.autograd.Function):

@@ -7,6 +7,7 @@ replaces the previous one.  A *store* is the PSF cache of one eye for one camera
 
 eye_filter        `EyeFilter`: one stream
 operator          `FilterOperator`: the filter of a frame as a matrix
+derivatives       derivatives of images by parameters of state and profile
 planned_frame     a frame whose eyes are prepared, and `Filtered`
 stream_eyes       the profiles of a stream, their stores and events
 frame_history     the last frames of a stream, which predict the next ones

@@ -1,4 +1,5 @@
 from .builder import Builder as Builder
+from .derivatives import image_derivatives as image_derivatives
 from .eye_filter import EyeFilter as EyeFilter
 from .operator import FilterOperator as FilterOperator
 from .planned_frame import Filtered as Filtered

@@ -2,6 +2,7 @@
 
 import copy
 import pickle
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -11,6 +12,7 @@ from torch.utils.data import DataLoader, Dataset
 
 from filter_service import Camera, EyeFilter, FilterSettings, RgbdView
 from ocufilter.torch import SeeThrough
+from tests.source_tree import ROOT
 
 SETTINGS = FilterSettings(mode="on-axis", eye_model="wavefront")
 STATE = {"pupil_diameter_mm": 4.0, "focus_dpt": 0.5}
@@ -161,3 +163,69 @@ def test_other_shapes_and_types_raise(see):
         see(torch.zeros(3, HEIGHT, WIDTH, dtype=torch.uint8))
     with pytest.raises(ValueError, match="in linear light, got float32"):
         see(np.zeros((3, HEIGHT, WIDTH), np.float32))
+
+
+def test_gradients_by_pupil_and_focus(see):
+    """Of a batch, against differences of the filter's images."""
+    own = copy.deepcopy(see)
+    own.render_tolerance = 0.0
+    own.focus_dpt = torch.nn.Parameter(torch.tensor(3.2))
+    own.pupil_diameter_mm = torch.tensor(4.0, requires_grad=True)
+    assert [name for name, _ in own.named_parameters()] == ["focus_dpt"]
+    color = rand(2)
+    own(color).square().sum().backward()
+    exact = copy.deepcopy(see)
+    exact.render_tolerance = 0.0
+
+    def loss(**state):
+        for name, value in {
+            "pupil_diameter_mm": 4.0,
+            "focus_dpt": 3.2,
+            **state,
+        }.items():
+            setattr(exact, name, value)
+        return float(exact(color).double().square().sum())
+
+    for name, step in (("pupil_diameter_mm", 0.05), ("focus_dpt", 0.05)):
+        value = getattr(own, name).item()
+        high, low = (loss(**{name: value + k * step}) for k in (1, -1))
+        slope = float(getattr(own, name).grad)
+        assert slope == pytest.approx((high - low) / (2.0 * step), rel=0.05)
+    own.focus_dpt.grad = None
+    own.pupil_diameter_mm = 4.0
+    color.requires_grad_()
+    own(color).sum().backward()
+    assert color.grad.abs().sum() > 0.0
+    own.close()
+    exact.close()
+
+
+def test_training_finds_the_focus():
+    """That makes a near target sharp: 3.7 dpt, as a scan of the focus shows."""
+    depth_m = np.full_like(DEPTH_M, 0.25)
+    start = torch.nn.Parameter(torch.tensor(3.3))
+    state = {"pupil_diameter_mm": 4.0, "focus_dpt": start}
+    see = SeeThrough("emmetropia", CAMERA, depth_m, **state, settings=SETTINGS)
+    optimizer = torch.optim.Adam(see.parameters(), lr=0.1)
+    color = rand()
+    losses = []
+    for _ in range(8):
+        optimizer.zero_grad()
+        loss = (see(color) - color).square().sum()
+        loss.backward()
+        optimizer.step()
+        losses.append(float(loss.detach()))
+    assert start.item() == pytest.approx(3.7, abs=0.3)
+    assert min(losses) < 0.2 * losses[0]
+    see.close()
+
+
+def test_the_examples_of_the_page_run(capsys):
+    text = (ROOT / "docs/how-to/gradients.md").read_text(encoding="utf-8")
+    names = {}
+    for example in re.findall(r"```py(?:thon)?\n(.*?)```", text, re.DOTALL):
+        exec(compile(example, "gradients.md", "exec"), names)
+    assert capsys.readouterr().out == "True\n(32, 48, 3) True\n"
+    assert names["x"].grad.abs().sum() > 0.0
+    assert abs(names["focus_dpt"].item() - 1.5) > 0.01  # a step of the optimizer
+    names["see"].close()

@@ -1,0 +1,235 @@
+"""Derivatives of a frame's image by parameters of the state and of the profile.
+
+They are central differences of operators with exact PSFs (a render tolerance of 0), at
+one and two steps to either side, whose truncation error falls with the fourth power of
+the step.  `STEPS` were chosen between truncation and the errors of PSFs, which change
+with the state by up to 1e-5 of white from layer to layer.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from filter_service.errors import BadMessage
+from filter_service.filtering.eye_filter import EyeFilter
+from filter_service.filtering.operator import FilterOperator
+from filter_service.rgbd_view import RgbdView
+from filter_service.settings import FilterSettings
+
+MULTIPLES = (-2, -1, 1, 2)
+"""Multiples of the step at which a derivative reads the image."""
+
+STEPS = {
+    "pupil_diameter_mm": 0.04,
+    "focus_dpt": 0.06,
+    "gaze_h_deg": 0.3,
+    "gaze_v_deg": 0.3,
+}
+"""Steps of the parameters of the state."""
+
+PROFILE_STEPS = {"_dpt": 0.06, "_um": 0.04, "_mm": 0.02, "_deg": 2.0}
+"""Steps of a profile's numbers, by the unit that ends the name of their field."""
+
+PROFILE_PREFIX = "profile."
+
+Point = tuple[dict[str, Any], dict[str, Any] | None]
+"""State, and the profile if it differs."""
+
+
+def image_derivatives(
+    eye_filter: EyeFilter,
+    color: ArrayLike,
+    depth_m: NDArray[Any] | RgbdView | Sequence[RgbdView],
+    parameters: Iterable[str],
+    *,
+    pupil_diameter_mm: float,
+    focus_dpt: float,
+    gaze_deg: tuple[float, float] | None = None,
+    profile: Mapping[str, Any] | None = None,
+    timeout_s: float = 120.0,
+) -> dict[str, NDArray[np.float32]]:
+    """Return the derivatives of an image by parameters of the state and the profile.
+
+    The image is that of `EyeFilter.operator` with ``render_tolerance=0``.  A derivative
+    is a difference of four such operators, each of which takes a second or more.  Their
+    sum, weighted by a change of the parameters, is the directional derivative.  Their
+    inner products with the gradient of a loss by the image are its gradient by the
+    parameters.
+
+    Derivatives exist where the image is a smooth function.  It is not where the eye
+    reaches the end of its range: beyond the far point, accommodation does not change,
+    and the derivative by focus is 0.  Depth is not a parameter, because the order of
+    occlusion changes abruptly.
+
+    Parameters
+    ----------
+    eye_filter : EyeFilter
+    color : (..., height, width, 3) floats
+        One or more colors in linear light, as for `FilterOperator.forward`.
+    depth_m : (height, width) float32, RgbdView, or sequence of RgbdView
+        As for `EyeFilter.operator`.
+    parameters : iterable of str
+        "pupil_diameter_mm", "focus_dpt", "gaze_h_deg", "gaze_v_deg", and paths of
+        numbers in the profile, such as "profile.sphere_dpt" or
+        "profile.zernike_um.4,0".  Their names end in mm, um, dpt or deg.
+    pupil_diameter_mm, focus_dpt, gaze_deg, timeout_s
+        As for `EyeFilter.filter`.
+    profile : mapping, optional
+        Profile of the filter as plain values, for derivatives by its numbers.
+
+    Returns
+    -------
+    dict of (..., height, width, 3) float32
+        Linear light per unit of each parameter.
+
+    Raises
+    ------
+    BadMessage
+        In addition to the errors of `EyeFilter.operator`: a parameter is unknown, or
+        the difference reads a state outside the ranges of the settings (a ValueError,
+        too).
+    """
+    settings = eye_filter.settings
+    state = {
+        "pupil_diameter_mm": pupil_diameter_mm,
+        "focus_dpt": focus_dpt,
+        "gaze_deg": settings.gaze_deg if gaze_deg is None else gaze_deg,
+    }
+
+    def operator_at(point: Point) -> FilterOperator:
+        own_state, own_profile = point
+        options = {**own_state, "render_tolerance": 0.0, "timeout_s": timeout_s}
+        if own_profile is None:
+            return eye_filter.operator(depth_m, **options)
+        with EyeFilter(
+            own_profile, eye_filter.cameras, settings, builder=eye_filter.builder
+        ) as other:
+            return other.operator(depth_m, **options)
+
+    found = {}
+    for name in dict.fromkeys(parameters):
+        step, points = _points(name, state, profile, settings)
+        low_2, low, high, high_2 = (
+            _images(operator_at(point), np.asarray(color)).astype(np.float64)
+            for point in points
+        )
+        slope = (8.0 * (high - low) - (high_2 - low_2)) / (12.0 * step)
+        found[name] = slope.astype(np.float32)
+    return found
+
+
+def _images(operator: FilterOperator, color: NDArray[Any]) -> NDArray[np.float32]:
+    """Return the images of one or more colors."""
+    batch = color.shape[: max(color.ndim - len(operator.color_shape), 0)]
+    colors = color.reshape(-1, *color.shape[len(batch) :])
+    images = [operator.forward(own) for own in colors]
+    return np.array(images, np.float32).reshape(*batch, *operator.image_shape)
+
+
+def _points(
+    name: str,
+    state: Mapping[str, Any],
+    profile: Mapping[str, Any] | None,
+    settings: FilterSettings,
+) -> tuple[float, list[Point]]:
+    """Return the step of a parameter, and state and profile at each point."""
+    if name in STEPS:
+        step = STEPS[name]
+        return step, [
+            (_moved(state, name, k * step, settings), None) for k in MULTIPLES
+        ]
+    if not name.startswith(PROFILE_PREFIX):
+        raise BadMessage(
+            f"{name!r}",
+            field="parameters",
+            allowed=f"{', '.join(STEPS)}, or {PROFILE_PREFIX} and the path of a number",
+        )
+    if profile is None:
+        raise BadMessage(
+            f"it is missing, for {name!r}",
+            field="profile",
+            allowed="the profile of the filter as plain values",
+        )
+    keys = name.removeprefix(PROFILE_PREFIX).split(".")
+    value = _number(profile, keys, name)
+    ends = [(key, s) for key in reversed(keys) for s in PROFILE_STEPS.items()]
+    step = next((step for key, (end, step) in ends if key.endswith(end)), 0.0)
+    if not step:
+        raise BadMessage(
+            f"{name!r}",
+            field="parameters",
+            allowed=f"a number whose name ends in {', '.join(PROFILE_STEPS)}",
+        )
+    return step, [
+        (dict(state), _with_number(profile, keys, value + k * step)) for k in MULTIPLES
+    ]
+
+
+def _moved(
+    state: Mapping[str, Any], name: str, change: float, settings: FilterSettings
+) -> dict[str, Any]:
+    """Return a state with one parameter changed, which must be in the range."""
+    h_deg, v_deg = state["gaze_deg"]
+    values = {**state, "gaze_h_deg": h_deg, "gaze_v_deg": v_deg}
+    axis = "hv".find(name.split("_")[1])
+    if name.startswith("gaze"):
+        if not settings.follows_field:
+            raise BadMessage(
+                f"{name!r} in mode {settings.mode}",
+                field="parameters",
+                allowed="gaze in the modes quality and dynamic",
+            )
+        middle, reach = settings.gaze_deg[axis], settings.gaze_range_deg[axis]
+        low, high = middle - reach, middle + reach
+        allowed = "gaze_range_deg"
+    else:
+        allowed = name.rpartition("_")[0].partition("_")[0] + (
+            "_range_mm" if name.endswith("_mm") else "_range_dpt"
+        )
+        low, high = getattr(settings, allowed)
+    values[name] += change
+    if not low <= values[name] <= high:
+        raise BadMessage(
+            f"differences read {values[name]:.4g}",
+            field=name,
+            allowed=f"{low:g} to {high:g}, the setting {allowed}",
+        )
+    return {
+        "pupil_diameter_mm": values["pupil_diameter_mm"],
+        "focus_dpt": values["focus_dpt"],
+        "gaze_deg": (values["gaze_h_deg"], values["gaze_v_deg"]),
+    }
+
+
+def _number(profile: Any, keys: list[str], name: str) -> float:
+    for key in keys:
+        try:
+            profile = profile[int(key) if isinstance(profile, list | tuple) else key]
+        except (KeyError, IndexError, ValueError, TypeError):
+            raise BadMessage(
+                f"{name!r}: there is no {key!r}",
+                field="parameters",
+                allowed="the path of a number in the profile",
+            ) from None
+    if isinstance(profile, bool) or not isinstance(profile, int | float):
+        raise BadMessage(
+            f"{name!r} is {profile!r}", field="parameters", allowed="a number"
+        )
+    return float(profile)
+
+
+def _with_number(
+    profile: Mapping[str, Any], keys: list[str], value: float
+) -> dict[str, Any]:
+    found: dict[str, Any] = copy.deepcopy(dict(profile))
+    *path, last = keys
+    inner: Any = found
+    for key in path:
+        inner = inner[int(key) if isinstance(inner, list) else key]
+    inner[int(last) if isinstance(inner, list) else last] = value
+    return found
