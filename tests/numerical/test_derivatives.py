@@ -38,7 +38,7 @@ def color():
 def depth_m():
     """A slanted surface beside a near one, which covers it."""
     y, x = np.mgrid[:HEIGHT, :WIDTH]
-    return np.where(x < 14, 0.4, 0.8 + 2.0 * y / HEIGHT).astype(np.float32)
+    return np.where(x < 14, 0.5, 0.8 + 1.2 * y / HEIGHT).astype(np.float32)
 
 
 def with_term(term, value_um):
@@ -127,7 +127,7 @@ def test_several_colors_have_derivatives_of_their_own(eye_filter, color, depth_m
         ("profile.kind", "is 'zernike'.*a number"),
         ("profile.zernike_um.9,1", "there is no '9,1'"),
         ("profile.sphere_dpt", "there is no 'sphere_dpt'"),
-        ("profile.wavelength_nm", "ends in _dpt, _um, _mm, _deg"),
+        ("profile.wavelength_nm", "ends in _dpt, _um, _mm, _mm3, _deg"),
     ],
 )
 def test_other_parameters_raise(eye_filter, color, depth_m, name, message):
