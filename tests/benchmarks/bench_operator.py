@@ -69,7 +69,12 @@ def rows_of(
 ) -> Iterator[Row]:
     """Rows of one eye; appends the ratios of its times."""
     profile = parse_profile({"kind": "preset", "name": name})
-    spec = grid_spec(view.camera, mode="dynamic")
+    spec = grid_spec(
+        view.camera,
+        mode="dynamic",
+        pupil_range_mm=(4.0, 5.0),
+        focus_range_dpt=(0.0, 1.0),
+    )
     eye, _ = eye_for_spec(profile, spec)
     engine = NativeRenderer()
     handle = engine.load(build_psf_store(eye, spec))

@@ -141,10 +141,13 @@ INLINE void prefetch_row(const uint32_t *texels) {
     for (int n = 0; n < 3; ++n) __builtin_prefetch(from + 64 * n);
 }
 
+/* What members add: light, and coverage without or with `scales`; or light alone. */
+enum { PLAIN_COVERAGE, SCALED_COVERAGE, LIGHT_ALONE };
+
 /* Adds members to `pairs` adjacent pairs of pixels, row by row: the sums of a row stay in
  * registers.  The compiler generates a loop for each number of pairs. */
 INLINE void add_columns(const frame *f, const members *all, int count, const level_image *image,
-                        raster *own, int pair, int pairs, int is_plain) {
+                        raster *own, int pair, int pairs, int kind) {
     ptrdiff_t stride = 4 * (ptrdiff_t)row_texels(image);
     const member *one = all->of, *end = all->of, *last = all->of + count;
     int row = larger_int(one->top, 0);
@@ -170,20 +173,22 @@ INLINE void add_columns(const frame *f, const members *all, int count, const lev
                 f32x8 weight = __builtin_convertvector(
                     pair_sums(read_pairs(from + 8 * p), factors), f32x8);
                 light[p] += weight * color;
-                if (is_plain) coverage[p] += weight;
-                else coverage[p] +=
+                if (kind == PLAIN_COVERAGE) coverage[p] += weight;
+                if (kind == SCALED_COVERAGE) coverage[p] +=
                     weight * load_twice4((const float *)(all->scales + (next - all->of)));
             }
         }
         for (int p = 0; p < pairs; ++p) {
             to[p].light += light[p];
-            to[p].coverage += is_plain ? coverage[p] * scales : coverage[p];
+            if (kind == PLAIN_COVERAGE) to[p].coverage += coverage[p] * scales;
+            if (kind == SCALED_COVERAGE) to[p].coverage += coverage[p];
         }
     }
 }
 
 /* Adds a cluster to a group of depths; fragments without a share in it are left out. */
-static void add_cluster(const frame *f, uint32_t at, int32_t number, depth_group *group) {
+INLINE void add_cluster_as(const frame *f, uint32_t at, int32_t number, depth_group *group,
+                           int with_coverage) {
     const cluster *from = f->clusters + at;
     const level_image *image = image_of(f, from->state);
     raster *own = group->sizes + image->resolution;
@@ -209,12 +214,25 @@ static void add_cluster(const frame *f, uint32_t at, int32_t number, depth_group
         }
 #define CASE(n)                                                                    \
     case n:                                                                        \
-        if (all.is_plain) add_columns(f, touch, count, image, own, pair, n, 1);    \
-        else add_columns(f, touch, count, image, own, pair, n, 0);                 \
+        if (!with_coverage)                                                        \
+            add_columns(f, touch, count, image, own, pair, n, LIGHT_ALONE);        \
+        else if (all.is_plain)                                                     \
+            add_columns(f, touch, count, image, own, pair, n, PLAIN_COVERAGE);     \
+        else                                                                       \
+            add_columns(f, touch, count, image, own, pair, n, SCALED_COVERAGE);    \
         break;
         switch (pairs) { CASE(1) CASE(2) CASE(3) CASE(4) default: break; }
 #undef CASE
     }
+}
+
+static void add_cluster(const frame *f, uint32_t at, int32_t number, depth_group *group) {
+    add_cluster_as(f, at, number, group, 1);
+}
+
+/* The same without coverage. */
+static void add_light(const frame *f, uint32_t at, int32_t number, depth_group *group) {
+    add_cluster_as(f, at, number, group, 0);
 }
 
 /* Pairs and rows of a raster that a kernel's box overlaps. */

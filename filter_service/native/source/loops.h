@@ -18,6 +18,7 @@
 #include "depths.h"
 #include "picture.h"
 #include "splat.h"
+#include "operator_plan.h"
 #include "operator.h"
 #include "shrink.h"
 #include "kernel_plan.h"
