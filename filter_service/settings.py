@@ -81,9 +81,10 @@ class RenderOptions(Record):
         from the frame's gaze; faster.  Frames without a gaze are not affected.
     bright_pixels : bool
         Whether pixels that are much brighter than white, or than what surrounds them,
-        are treated as light sources: with their light beyond the kernels, and without
-        amplification where coverage is missing.  With this and ``merge`` off, the image
-        is a linear function of linear light, as in `EyeFilter.operator`.
+        are treated as light sources, without amplification where coverage is missing,
+        and whether the image contains the light of all pixels beyond their kernels.
+        With this and ``merge`` off, the image is a linear function of linear light, as
+        in `EyeFilter.operator`.
     """
 
     accumulation: Accumulation = "coverage"

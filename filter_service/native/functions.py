@@ -42,4 +42,8 @@ FUNCTIONS = {
     "add_sources": "pool i8[] i8[] f4[] i8 f4[] i8 f4[] i8 i8",
     "add_plane": "pool f4[] i8 i8 f4[] i8 i8",
     "add_and_encode": "pool f4[] i8 i8 f4[] i8 i8 u1[]",
+    "fill_tails": "record",
+    "square_means": "pool u1[] f4[] i8 i8 f8 f8 f8 f4[]",
+    "spread_tails": "record",
+    "add_tails": "pool f4[] i8 i8 f4[] i8 i8 u1[]",
 }

@@ -139,6 +139,9 @@ class Frame(c.Structure):
         ("output_kind", c.c_int32),
         ("failed", c.c_int32),
         ("entry_count", c.c_int64),
+        ("squares", POINTER),
+        ("square_rows", c.c_int64),
+        ("square_columns", c.c_int64),
     )
 
 
@@ -322,6 +325,52 @@ class LightJob(c.Structure):
     )
 
 
+class TailsJob(c.Structure):
+    """Job that computes the tails of kernels; see `source/edge_job.h`."""
+
+    _fields_ = (
+        ("threads", POINTER),
+        ("tables", StoreTables),
+        ("reads", StateReads),
+        ("nodes", POINTER),
+        ("weight_ratio", POINTER),
+        ("layer_dpt", POINTER),
+        ("layer_ratio", POINTER),
+        ("zero_dpt", POINTER),
+        ("maps", POINTER),
+        ("edges", POINTER),
+        ("step_px", POINTER),
+        ("near", POINTER),
+        ("far", POINTER),
+        ("count", c.c_int64),
+    )
+
+
+MEANS_LEVELS, MAX_LEVELS = 4, 8
+"""Levels of squares with mean light, and largest number of levels; `edge_job.h`."""
+
+
+class SpreadJob(c.Structure):
+    """Job that adds the tails of kernels; see `source/edge_job.h`."""
+
+    _fields_ = (
+        ("threads", POINTER),
+        ("kinds", POINTER),
+        ("near", POINTER),
+        ("far", POINTER),
+        ("powers", POINTER),
+        ("levels", POINTER * MEANS_LEVELS),
+        ("planes", POINTER * MAX_LEVELS),
+        ("squares", POINTER),
+        ("rows", c.c_int64),
+        ("columns", c.c_int64),
+        ("block_rows", c.c_int64),
+        ("block_columns", c.c_int64),
+        ("count", c.c_int64),
+        ("n_levels", c.c_int32),
+    )
+
+
 class SizeJob(c.Structure):
     """Job that plans kernels; `source/kernel_job.h` documents the fields."""
 
@@ -403,5 +452,7 @@ SIZES = (
     c.sizeof(LightJob),
     c.sizeof(NodeJob),
     c.sizeof(ListJob),
+    c.sizeof(TailsJob),
+    c.sizeof(SpreadJob),
 )
 """Expected result of `ocu_sizes`."""

@@ -32,6 +32,7 @@ media_effects    effects of ocular media and spectacles; straylight
 edge_kinds       bright pixels, and the edges that send their light
 edge_light       light of bright pixels beyond their kernels
 light_kernels    kernels of their light, its visibility and addition
+tails            light of all other pixels beyond their kernels
 gl/              engine of compute shaders
 native/          engine of compiled loops
 """

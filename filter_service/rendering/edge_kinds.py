@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,12 @@ from filter_service.planning.grid import GREEN
 from filter_service.psfs.frame_layers import FrameLayers
 from filter_service.rendering.engine import ViewRequest, clamped_gaze
 from filter_service.rendering.frame import fill_missing_depth, stretch_at
-from filter_service.rendering.frame_kernels import interval_count
+from filter_service.rendering.frame_kernels import (
+    FrameKernels,
+    MissingPsfs,
+    frame_kernels,
+    interval_count,
+)
 from filter_service.rendering.frame_states import FrameStore
 from filter_service.rendering.image_cells import ImageCells
 from filter_service.rgbd_view import RgbdView
@@ -244,6 +250,41 @@ class EyeAtFrame:
         )
         return row, column, upper * (1.0 - v) + lower * v
 
+    def intervals_at(
+        self, layer_dpt: NDArray[np.float64]
+    ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """Return the intervals (n,) of layer positions (n,), and the places in them."""
+        steps_dpt = self.layers.layer_dpt
+        interval = np.searchsorted(steps_dpt, layer_dpt, side="right") - 1
+        interval = np.clip(interval, 0, interval_count(self.layers) - 1)
+        upper = np.minimum(interval + 1, steps_dpt.size - 1)
+        step_dpt = steps_dpt[upper] - steps_dpt[interval]
+        part = (layer_dpt - steps_dpt[interval]) / np.where(
+            step_dpt > 0.0, step_dpt, 1.0
+        )
+        return interval, np.clip(part, 0.0, 1.0)
+
+    def kernels(
+        self, kinds: SourceKinds, until_s: float | None
+    ) -> FrameKernels | MissingPsfs:
+        """Return the kernels of kinds, and compute missing PSFs until a deadline."""
+        store = self.handle.store
+        used = np.zeros((self.image.count, interval_count(self.layers)), bool)
+        used[kinds.cell, kinds.interval] = True
+        fill = partial(store.fill, until_s=until_s)
+        return frame_kernels(store, self.layers, self.image, used, fill=fill)
+
+    def ends_of(
+        self, kinds: SourceKinds, kernels: FrameKernels
+    ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        """Return the maps (n, 2, 3, 2, 2) and the largest reach (n,) of kinds."""
+        n_intervals = interval_count(self.layers)
+        pair = np.searchsorted(
+            kernels.cells * n_intervals + kernels.intervals,
+            kinds.cell * n_intervals + kinds.interval,
+        )
+        return kernels.maps[pair], kernels.reach_px[pair].max(axis=1)
+
 
 @dataclass(frozen=True)
 class SourceKinds:
@@ -266,8 +307,8 @@ class SourceKinds:
     is_similar: NDArray[np.bool_]
     place: NDArray[np.int64]
     cell: NDArray[np.int64]
-    interval: NDArray[np.int64]
     layer_dpt: NDArray[np.float64]
+    interval: NDArray[np.int64]
     part_ratio: NDArray[np.float64]
 
     @classmethod
@@ -299,21 +340,13 @@ class SourceKinds:
         difference = np.abs(place - place[kept][nearest]).max(axis=1)
         is_similar = (difference <= SIMILAR_STEPS)[of_source]
         of_source, place, first = nearest[of_source], place[kept], first[kept]
-        interval = np.searchsorted(steps_dpt, layer_dpt[first], side="right") - 1
-        interval = np.clip(interval, 0, interval_count(layers) - 1)
-        upper = np.minimum(interval + 1, steps_dpt.size - 1)
-        step_dpt = steps_dpt[upper] - steps_dpt[interval]
-        part = (layer_dpt[first] - steps_dpt[interval]) / np.where(
-            step_dpt > 0.0, step_dpt, 1.0
-        )
         return cls(
             of_source,
             is_similar,
             place,
             cell[first],
-            interval,
             layer_dpt[first],
-            np.clip(part, 0.0, 1.0),
+            *state.intervals_at(layer_dpt[first]),
         )
 
     def grouped(self, group: NDArray[np.int64], count: int) -> NDArray[np.int64]:

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -31,12 +30,7 @@ from filter_service.rendering.edge_kinds import (
     SourceKinds,
 )
 from filter_service.rendering.engine import ViewRequest
-from filter_service.rendering.frame_kernels import (
-    FrameKernels,
-    MissingPsfs,
-    frame_kernels,
-    interval_count,
-)
+from filter_service.rendering.frame_kernels import FrameKernels, MissingPsfs
 from filter_service.rendering.light_kernels import (
     FADE_RATIO,
     FINE,
@@ -49,6 +43,7 @@ from filter_service.rendering.light_kernels import (
     places_around,
     seen_by_edges,
 )
+from filter_service.rendering.tails import SQUARE_PX, KernelTails
 from filter_service.rgbd_view import RgbdView
 
 RADII_PX = (16, 24, 36, 54, 81, 122, 182, 273, 410)
@@ -96,6 +91,8 @@ class EdgeLight:
         Kinds of the bright pixels.
     kernels : FrameKernels
         Kernels of the kinds.
+    tails : KernelTails, optional
+        Light of the other pixels, which is added first.
 
     Attributes
     ----------
@@ -112,7 +109,9 @@ class EdgeLight:
         white: float,
         kinds: SourceKinds,
         kernels: FrameKernels,
+        tails: KernelTails | None = None,
     ):
+        self._tails = tails
         self._state, self._pixels, self._white = state, pixels, white
         self._kinds = kinds
         self._edges = EdgeElements.of(state, kinds)
@@ -131,10 +130,17 @@ class EdgeLight:
         self.view = self._dimmed(view)
 
     @classmethod
-    def of(cls, request: ViewRequest, view: RgbdView) -> EdgeLight | MissingPsfs | None:
+    def of(
+        cls, request: ViewRequest, view: RgbdView, tails: KernelTails | None = None
+    ) -> EdgeLight | MissingPsfs | None:
         """Return the light of a view in linear light, or None if nothing is bright.
 
         It returns missing PSFs like `FrameEngine.begin`.
+
+        Parameters
+        ----------
+        tails : KernelTails, optional
+            Light of the other pixels, which is added first.
         """
         white = request.white_level
         if white is None:
@@ -152,23 +158,14 @@ class EdgeLight:
         with request.times.wall("edge_light_ms"):
             state = EyeAtFrame.of(request)
             kinds = SourceKinds.of(state, pixels)
-            used = np.zeros((state.image.count, interval_count(state.layers)), bool)
-            used[kinds.cell, kinds.interval] = True
-            fill = partial(store.fill, until_s=request.until_s)
-            kernels = frame_kernels(store, state.layers, state.image, used, fill=fill)
+            kernels = state.kernels(kinds, request.until_s)
             if isinstance(kernels, MissingPsfs):
                 return kernels
-            return cls(state, view, pixels, white, kinds, kernels)
+            return cls(state, view, pixels, white, kinds, kernels, tails)
 
     def _find_ends(self, kernels: FrameKernels) -> None:
         """Find where the kernels of the kinds end."""
-        kinds, n_intervals = self._kinds, interval_count(self._state.layers)
-        pair = np.searchsorted(
-            kernels.cells * n_intervals + kernels.intervals,
-            kinds.cell * n_intervals + kinds.interval,
-        )
-        self._maps = kernels.maps[pair]
-        self._end_px = kernels.reach_px[pair].max(axis=1)
+        self._maps, self._end_px = self._state.ends_of(self._kinds, kernels)
         radii_px = np.array(RADII_PX)
         corner_px = math.sqrt(2.0) * self._end_px + 1.0
         self._exact_px = np.maximum(corner_px, RHO_PX[0] + 1.0).astype(np.float32)
@@ -266,6 +263,17 @@ class EdgeLight:
             beyond = self._polar[kinds, :, at].mean(axis=1)
             ratio[n + kinds] = 2.0 * np.pi * beyond / middle_px
             ratio[kinds] += ratio[n + kinds]
+        if self._tails is not None:
+            # Which dim the pixel, too.
+            count = np.maximum(np.bincount(self._kinds.of_source, minlength=n), 1)
+            x_px, y_px = self._pixels.source_at_px.T // SQUARE_PX
+            taken = self._tails.squares[y_px, x_px, 4:]
+            for c in range(RGB):
+                mean = (
+                    np.bincount(self._kinds.of_source, taken[:, c], minlength=n) / count
+                )
+                taken_c = np.tile(mean, 2)
+                ratio[:, c] = (ratio[:, c] - taken_c) / (1.0 - taken_c)
         kind = np.where(self._kinds.is_similar, 0, n) + self._kinds.of_source
         pixels, colors = self._pixels, []
         for surface, color in enumerate(view.surface_colors):

@@ -74,6 +74,10 @@ class ViewRequest:
     waits : bool
         Whether to wait until a frame in textures is finished, and to repeat it until it
         is complete, so that `ViewResult.earlier` describes this frame.
+    is_encoded : bool, optional
+        Whether the caller encodes the image for a display; by default as ``output``.
+    added_light : (rows, columns, 8), optional
+        Light of `KernelTails`, for engines that add it.
     """
 
     view: RgbdView | TextureView
@@ -88,6 +92,13 @@ class ViewRequest:
     target_is_top_first: bool | None = None
     gain_ratio: tuple[float, float, float] = (1.0, 1.0, 1.0)
     waits: bool = False
+    is_encoded: bool | None = None
+    added_light: NDArray[np.float32] | None = None
+
+    @property
+    def merges_for_display(self) -> bool:
+        """Whether dark parts need a finer tolerance of merging."""
+        return self.output == "srgb8" if self.is_encoded is None else self.is_encoded
 
     @property
     def merging(self) -> Merging:
@@ -191,6 +202,10 @@ class FrameEngine(Protocol):
     @property
     def name(self) -> str:
         """Name of the renderer in replies and in `ocufilter doctor`."""
+
+    @property
+    def adds_light(self) -> bool:
+        """Whether frames include the light of `KernelTails` in the request."""
 
     @property
     def importer(self) -> Any:

@@ -47,6 +47,7 @@ from filter_service.rendering.engine import (
 from filter_service.rendering.frame import white_level
 from filter_service.rendering.frame_kernels import MissingPsfs
 from filter_service.rendering.light_kernels import add_plane
+from filter_service.rendering.tails import KernelTails
 from filter_service.rgbd_view import RgbdView
 from filter_service.texture_view import TextureView
 
@@ -489,17 +490,31 @@ def _begin(
         request = replace(request, view=view)
     request = with_exact_psfs(engine, request)
     edge_light: EdgeLight | MissingPsfs | None = None
+    white: float | None = None
     if view.color.dtype != np.uint8 and request.options.bright_pixels:
-        request = replace(request, white_level=white_level(view.color))
-        edge_light = EdgeLight.of(request, view)
+        white = white_level(view.color)
+        request = replace(request, white_level=white)
+    tails = KernelTails.of(request, white)
+    if isinstance(tails, MissingPsfs):
+        missing = tails
+        return lambda: missing
+    if white is not None:
+        edge_light = EdgeLight.of(request, view, tails)
     if isinstance(edge_light, MissingPsfs):
         missing = edge_light
         return lambda: missing
     if edge_light is not None:
         request = replace(request, view=edge_light.view)
-    elif effects is None:
+    if tails is not None and engine.adds_light:
+        request = replace(request, added_light=tails.squares)
+        tails = None
+    if edge_light is None and effects is None and tails is None:
         return engine.begin(request)
-    begun = engine.begin(replace(request, output="linear", out=None))
+    is_direct = edge_light is None and effects is None  # nothing follows the tails
+    output = request.output
+    begun = engine.begin(
+        replace(request, output="linear", out=None, is_encoded=output == "srgb8")
+    )
 
     def finish() -> ViewResult | MissingPsfs:
         rendered = begun()
@@ -507,16 +522,25 @@ def _begin(
             return rendered
         color = np.ascontiguousarray(rendered.color, dtype=np.float32)
         coarse = NOTHING
+        if tails is not None:
+            with times.wall("tails_ms"):
+                if is_direct and output == "srgb8":
+                    found = np.empty(color.shape, np.uint8)
+                    tails.add(color, found)
+                    return replace(rendered, color=found)
+                tails.add(color)
+                if is_direct:
+                    return replace(rendered, color=encoded(color, output))
         if edge_light is not None:
             with times.wall("edge_light_ms"):
                 coarse = edge_light.add(color)
-                if coarse.size and (effects is not None or request.output != "srgb8"):
+                if coarse.size and (effects is not None or output != "srgb8"):
                     add_plane(coarse, color)
                     coarse = NOTHING
         with times.wall("edge_light_ms" if effects is None else "media_ms"):
             if effects is not None:
                 effects.apply(color, view.camera)
-            color = encoded(color, request.output, coarse)
+            color = encoded(color, output, coarse)
         return replace(rendered, color=color)
 
     return finish

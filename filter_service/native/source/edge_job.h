@@ -53,4 +53,35 @@ typedef struct {
     int64_t n_phi, n_fine, side, count;
 } light_job;
 
+/* Tails of blended kernels, see tails.h. */
+typedef struct {
+    pool *threads;
+    store_tables tables;
+    state_reads reads;
+    const int64_t *nodes;     /* as in omitted_job */
+    const double *weight_ratio, *layer_dpt, *layer_ratio, *zero_dpt, *maps;
+    const float *edges;       /* (count, 3, EDGE_ROWS, N_EDGE) */
+    const int64_t *step_px;   /* (count,) */
+    float *near, *far;        /* (count, NEAR_TAPS, 3), (count, FAR_TAPS, 3) */
+    int64_t count;
+} tails_job;
+
+/* Blocks of pixels that share a kernel are the squares of this level; those of level 0 are of
+ * SQUARE_PX, see added_light.h. */
+#define BLOCK_LEVEL 3
+#define MAX_LEVELS 8
+
+/* Light beyond kernels of all squares. */
+typedef struct {
+    pool *threads;
+    const uint8_t *kinds;     /* (block_rows, block_columns): kernel of each block */
+    const float *near, *far;  /* as in tails_job */
+    const int64_t *powers;    /* (count,): level of each near kernel; that of the far is one more */
+    float *levels[BLOCK_LEVEL + 1];             /* mean light (3, rows, columns) of squares */
+    float *planes[MAX_LEVELS];                  /* (2, 3, rows, columns), zero before */
+    float *squares;           /* (rows, columns, 8), zero before; see added_light */
+    int64_t rows, columns, block_rows, block_columns, count;
+    int32_t n_levels;
+} spread_job;
+
 #endif

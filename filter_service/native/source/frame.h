@@ -5,6 +5,7 @@
 
 #include <stdint.h>
 
+#include "added_light.h"
 #include "constants.h"
 #include "pool.h"
 
@@ -199,6 +200,7 @@ typedef struct {
     int32_t output_kind;      /* as color_kind */
     int32_t failed;           /* out of memory */
     int64_t entry_count;
+    added_light added;
 } frame;
 
 #endif

@@ -26,4 +26,6 @@ EXPORT void ocu_sizes(int32_t *sizes) {
     sizes[n++] = (int32_t)sizeof(light_job);
     sizes[n++] = (int32_t)sizeof(node_job);
     sizes[n++] = (int32_t)sizeof(list_job);
+    sizes[n++] = (int32_t)sizeof(tails_job);
+    sizes[n++] = (int32_t)sizeof(spread_job);
 }

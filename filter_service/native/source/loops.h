@@ -30,6 +30,7 @@
 #include "planes.h"
 #include "visibility.h"
 #include "edge_light.h"
+#include "tails.h"
 
 static void pixels(frame *f) {
     f->missing_count = f->clamped_count = f->bad_color_count = 0;
@@ -119,6 +120,10 @@ static const named_function functions[] = {
     FUNCTION(add_sources),
     FUNCTION(add_plane),
     FUNCTION(add_and_encode),
+    FUNCTION(fill_tails),
+    FUNCTION(square_means),
+    FUNCTION(spread_tails),
+    FUNCTION(add_tails),
     {NULL, NULL},
 };
 

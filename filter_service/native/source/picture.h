@@ -77,13 +77,19 @@ INLINE void write_window_as(const frame *f, int kind, const window *w, const pix
     if (left >= right) return;
     size_t size = pixel_bytes(kind);
     uint8_t row[BIN_WIDTH * RGB * sizeof(float)];
+    f32x8 blended[BIN_WIDTH / SQUARE_PX + 2];
+    int from_px = left - f->border_px, first = from_px / SQUARE_PX - 1;
     for (int y = larger_int(w->y0, f->border_px); y < bottom; ++y) {
+        if (f->added.squares != NULL)
+            blend_squares(&f->added, y - f->border_px, first, BIN_WIDTH / SQUARE_PX + 2, blended);
         for (int x = 0; x < w->width; x += 2) {
             int pair = (y - w->y0) * PAIRS_ACROSS + x / 2;
             f32x8 light = total == NULL
                               ? seen_light(f, sums + pair, w->x0 + x, y, left, right)
                               : mixed_light(f, sums + pair, total + pair, w->x0 + x, y, left,
                                             right);
+            if (f->added.squares != NULL && w->x0 + x >= left && w->x0 + x < right)
+                light = with_light(light, blended, first, w->x0 + x - f->border_px);
             encode_pair(kind, light, row + size * (size_t)x);
         }
         size_t to = (size_t)(y - f->border_px) * (size_t)f->image_width

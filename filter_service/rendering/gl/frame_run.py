@@ -403,7 +403,7 @@ class FrameRun:
             counted_px=counted_px(rows, self._view, plan.border_px),
             object_range_dpt=self._eye.handle.prepared_range_dpt,
             white_level=plan.white_level,
-            is_encoded=self.output == "srgb8",
+            is_encoded=self._request.merges_for_display,
         )
         eye = self._eye
         return FramePasses(

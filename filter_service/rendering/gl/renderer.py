@@ -46,6 +46,8 @@ class FilterRenderer(OneView):
         self._had_missing_depth = False
         self._textures: TextureFrames | None = None
 
+    adds_light = False
+
     @property
     def name(self) -> str:
         """Name of the OpenGL renderer."""

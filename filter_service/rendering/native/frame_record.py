@@ -593,3 +593,8 @@ class FrameRecord:
         """Set the pointer to the output image."""
         self.c.picture = self._pointer_to(picture)
         self.c.output_kind = COLOR_KINDS[picture.dtype.name]
+
+    def set_added_light(self, squares: NDArray[np.float32]) -> None:
+        """Set light (rows, columns, 8) that is added, see `KernelTails`."""
+        self.c.squares = self._pointer_to(squares)
+        self.c.square_rows, self.c.square_columns = squares.shape[:2]

@@ -200,6 +200,7 @@ class NativeRenderer(OneView):
         return f"native ({self._loops.variant}, {self._n_threads} threads)"
 
     importer = None
+    adds_light = True
 
     @property
     def memory_mb(self) -> float:
@@ -324,7 +325,7 @@ class NativeRenderer(OneView):
             frame.set_merging(
                 request.merging,
                 white_level=white,
-                is_encoded=request.output == "srgb8",
+                is_encoded=request.merges_for_display,
             )
             self._loops.call("merge", frame.c)
         return frame, plan, self._blend(timer, frame, plan, eye), missing_count
@@ -335,6 +336,8 @@ class NativeRenderer(OneView):
         with timer.wall("splat_ms"):
             picture = output_array(request)
             frame.set_picture(picture)
+            if request.added_light is not None:
+                frame.set_added_light(request.added_light)
             self._loops.call("splat", frame.c)
         frame.eye_arrays.end_frame()
         if frame.c.failed:
@@ -452,6 +455,7 @@ class NativeLanes(OneView):
         self._is_busy = False
 
     importer = None
+    adds_light = True
 
     @property
     def name(self) -> str:
