@@ -45,6 +45,16 @@ KERNEL_IMAGE_BYTES = 128
 RECIPE_IMAGE_BYTES = 16
 
 
+class AddedLight(c.Structure):
+    """Light on squares that is added; `source/added_light.h` documents the fields."""
+
+    _fields_ = (
+        ("squares", POINTER),
+        ("rows", c.c_int64),
+        ("columns", c.c_int64),
+    )
+
+
 class Frame(c.Structure):
     """Argument of all stages; `source/frame.h` documents the fields."""
 
@@ -139,9 +149,7 @@ class Frame(c.Structure):
         ("output_kind", c.c_int32),
         ("failed", c.c_int32),
         ("entry_count", c.c_int64),
-        ("squares", POINTER),
-        ("square_rows", c.c_int64),
-        ("square_columns", c.c_int64),
+        ("added", AddedLight),
     )
 
 
@@ -361,7 +369,6 @@ class SpreadJob(c.Structure):
         ("powers", POINTER),
         ("levels", POINTER * MEANS_LEVELS),
         ("planes", POINTER * MAX_LEVELS),
-        ("squares", POINTER),
         ("rows", c.c_int64),
         ("columns", c.c_int64),
         ("block_rows", c.c_int64),

@@ -97,7 +97,7 @@ class KernelTails:
             for level in range(n_levels)
         ]
         levels = [np.empty((RGB, *s), np.float32) for s in shapes[:MEANS_LEVELS]]
-        planes = [np.zeros((2, RGB, *shape), np.float32) for shape in shapes]
+        planes = [np.zeros((*shape, 8), np.float32) for shape in shapes]
         color = np.ascontiguousarray(view.color)
         if color.dtype != np.uint8:
             color = color.astype(np.float32, copy=False)
@@ -117,13 +117,11 @@ class KernelTails:
             n_levels=n_levels,
             **pointers(kinds=kinds, near=near, far=far, powers=powers),
         )
-        squares = np.zeros((*shapes[0], 8), np.float32)
-        job.squares = pointers(array=squares)["array"]
         for name, arrays in (("levels", levels), ("planes", planes)):
             for level, array in enumerate(arrays):
                 getattr(job, name)[level] = pointers(array=array)["array"]
         loops().call("spread_tails", job)
-        self.squares = squares
+        self.squares = planes[0]
 
     @classmethod
     def of(

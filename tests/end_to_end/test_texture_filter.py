@@ -22,7 +22,9 @@ from tests.numerical.test_gl_objects import counted_objects
 pytestmark = pytest.mark.gl
 
 SIZE_PX = WIDTH, HEIGHT = 160, 90
-STATE = {"pupil_diameter_mm": 4.0, "focus_dpt": 0.5}
+STATE = {"pupil_diameter_mm": 4.0, "focus_dpt": 0.5, "bright_pixels": False}
+"""Frames in arrays otherwise contain the light beyond kernels."""
+
 SETTINGS = {"mode": "dynamic", "tolerance": "loose"}
 NEAR_M = 0.05
 

@@ -23,6 +23,7 @@ DIMENSIONLESS = {
     "color": "light, sRGB or linear as the header says",
     "hidden_color": "as color",
     "light": "linear light in the unit of an image",
+    "added_light": "as light",
     "white_level": "as light",
     "max_repeat_difference": "levels of 255, or linear light",
     "elements": "points and directions in pixels, lengths times light",

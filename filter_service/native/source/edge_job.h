@@ -78,8 +78,7 @@ typedef struct {
     const float *near, *far;  /* as in tails_job */
     const int64_t *powers;    /* (count,): level of each near kernel; that of the far is one more */
     float *levels[BLOCK_LEVEL + 1];             /* mean light (3, rows, columns) of squares */
-    float *planes[MAX_LEVELS];                  /* (2, 3, rows, columns), zero before */
-    float *squares;           /* (rows, columns, 8), zero before; see added_light */
+    float *planes[MAX_LEVELS];                  /* as in added_light, zero before */
     int64_t rows, columns, block_rows, block_columns, count;
     int32_t n_levels;
 } spread_job;

@@ -141,7 +141,8 @@ static void tail_channel(void *argument, int item, int thread) {
             if (share > MIN_OMITTED)
                 light[at] = share * edge_density(edge, seen, (float)x, (float)y);
         }
-    squares_of(light, NEAR_STEPS, NEAR_STRIDE, NEAR_SQUARES, 4, job->near + RGB * NEAR_TAPS * n + channel);
+    squares_of(light, NEAR_STEPS, NEAR_STRIDE, NEAR_SQUARES, 4,
+               job->near + RGB * NEAR_TAPS * n + channel);
     scale_edge(own, per_step / (float)FAR_SAMPLE_STEPS, edge);
     for (int y = -FAR_SAMPLES; y <= FAR_SAMPLES; ++y)
         for (int x = -FAR_SAMPLES; x <= FAR_SAMPLES; ++x) {
@@ -154,7 +155,8 @@ static void tail_channel(void *argument, int item, int thread) {
             far[(y + FAR_SAMPLES) * FAR_SIDE + x + FAR_SAMPLES] =
                 share * edge_density(edge, seen, (float)x, (float)y);
         }
-    squares_of(far, FAR_SAMPLES, FAR_SIDE, FAR_SQUARES, 2, job->far + RGB * FAR_TAPS * n + channel);
+    squares_of(far, FAR_SAMPLES, FAR_SIDE, FAR_SQUARES, 2,
+               job->far + RGB * FAR_TAPS * n + channel);
 }
 
 /* Writes the tails of blended kernels as kernels on squares. */
@@ -195,11 +197,11 @@ static void row_of_means(void *argument, int row, int thread) {
         for (int64_t at = y; at < end_y; ++at) {
             int64_t first = RGB * (at * job->width + x), count = RGB * (end_x - x);
             if (job->bytes != NULL)
-                for (const uint8_t *b = job->bytes + first; b < job->bytes + first + count; b += RGB)
-                    for (int c = 0; c < RGB; ++c) sum[c] += linear_of_byte[b[c]];
+                for (int64_t i = first; i < first + count; i += RGB)
+                    for (int c = 0; c < RGB; ++c) sum[c] += linear_of_byte[job->bytes[i + c]];
             else
-                for (const float *f = job->floats + first; f < job->floats + first + count; f += RGB)
-                    add_float_pixel(job, f, sum);
+                for (int64_t i = first; i < first + count; i += RGB)
+                    add_float_pixel(job, job->floats + i, sum);
         }
         float share = 1.0f / (float)((end_y - y) * (end_x - x));
         for (int c = 0; c < RGB; ++c)
@@ -240,7 +242,9 @@ INLINE int list_taps(const float *kernel, int squares, tail_tap *taps) {
 }
 
 /* Level 0 has squares of SQUARE_PX; each next level has squares of twice the size. */
-INLINE int64_t level_size(int64_t squares, int level) { return (squares + (1 << level) - 1) >> level; }
+INLINE int64_t level_size(int64_t squares, int level) {
+    return (squares + (1 << level) - 1) >> level;
+}
 
 /* Writes the light of a square of several blocks, of those that have a kernel, and their
  * share. */
@@ -334,8 +338,7 @@ static void spread_kind(const spread_job *job, int level, int kind, int squares,
     float around[(RGB + 1) * PLANE];
     int count = list_taps(kernel, squares, taps);
     read_around(job, level, kind, top, left, around);
-    float *planes = job->planes[level];
-    int64_t end = smaller_index(TILE_ROWS, rows - top), plane = rows * columns;
+    int64_t end = smaller_index(TILE_ROWS, rows - top);
     for (int64_t y = 0; y < end; ++y)
         for (int64_t x = 0; x < TILE_COLUMNS && left + x < columns; x += 8) {
             const float *own = around + (y + FAR_SQUARES) * HALO_STRIDE + x + FAR_SQUARES;
@@ -343,12 +346,11 @@ static void spread_kind(const spread_job *job, int level, int kind, int squares,
             if (is_only) receive(taps, count, own, 1, light, share);
             else receive(taps, count, own, 0, light, share);
             int64_t width = smaller_index(columns - left - x, 8);
-            for (int c = 0; c < RGB; ++c) {
-                float *to = planes + c * plane + (top + y) * columns + left + x;
-                for (int i = 0; i < width; ++i) {
-                    to[i] += light[c][i];
-                    to[RGB * plane + i] += share[c][i];
-                }
+            float *to = job->planes[level] + 8 * ((top + y) * columns + left + x);
+            for (int i = 0; i < width; ++i, to += 8) {
+                f32x8 sum = {light[0][i], light[1][i], light[2][i], 0.0f,
+                             share[0][i], share[1][i], share[2][i], 0.0f};
+                store8(to, load8(to) + sum);
             }
         }
 }
@@ -396,36 +398,30 @@ static void halve_means(const float *fine, int64_t rows, int64_t columns, float 
 
 typedef struct { const spread_job *job; int level; } raise_job;
 
-/* Item: a row of a plane, to which the next level is added, interpolated. */
-static void raise_row(void *argument, int item, int thread) {
+/* Item: a row of squares, to which the next level is added, interpolated. */
+static void raise_row(void *argument, int y, int thread) {
     (void)thread;
     const raise_job *own = argument;
     const spread_job *job = own->job;
-    int64_t rows = level_size(job->rows, own->level), columns = level_size(job->columns, own->level);
-    int64_t coarse_rows = level_size(rows, 1), coarse_columns = level_size(columns, 1);
-    int64_t y = item % rows, plane = item / rows, near = y / 2;
+    int64_t columns = level_size(job->columns, own->level);
+    int64_t coarse_rows = level_size(job->rows, own->level + 1), last = level_size(columns, 1) - 1;
+    int64_t near = y / 2;
     int64_t far = y % 2 ? smaller_index(near + 1, coarse_rows - 1) : larger_index(near - 1, 0);
-    const float *from = job->planes[own->level + 1] + plane * coarse_rows * coarse_columns;
-    const float *upper = from + near * coarse_columns, *lower = from + far * coarse_columns;
-    float *to = job->planes[own->level] + (plane * rows + y) * columns;
-    for (int64_t x = 0; x < columns; ++x) {
-        int64_t first = x / 2;
-        int64_t next = x % 2 ? smaller_index(first + 1, coarse_columns - 1) : larger_index(first - 1, 0);
-        to[x] += 0.75f * (0.75f * upper[first] + 0.25f * lower[first])
-                 + 0.25f * (0.75f * upper[next] + 0.25f * lower[next]);
+    const float *upper = job->planes[own->level + 1] + 8 * near * (last + 1);
+    const float *lower = job->planes[own->level + 1] + 8 * far * (last + 1);
+    float *to = job->planes[own->level] + 8 * y * columns;
+    f32x8 most = all8(0.75f), rest = all8(0.25f), before = all8(0.0f), here = before;
+    for (int64_t x = -1; x <= last; ++x) { /* `here` is of column x, but for margins */
+        int64_t at = 8 * smaller_index(x + 1, last);
+        f32x8 after = most * load8(upper + at) + rest * load8(lower + at);
+        if (x < 0) here = after;
+        f32x8 middle = most * here;
+        if (x >= 0) store8(to + 16 * x, load8(to + 16 * x) + middle + rest * before);
+        if (x >= 0 && 2 * x + 1 < columns)
+            store8(to + 16 * x + 8, load8(to + 16 * x + 8) + middle + rest * after);
+        before = here;
+        here = after;
     }
-}
-
-/* Item: a row of squares, whose planes are interleaved. */
-static void interleave_row(void *argument, int row, int thread) {
-    (void)thread;
-    const spread_job *job = argument;
-    float *to = job->squares + 8 * row * job->columns;
-    for (int64_t x = 0; x < job->columns; ++x, to += 8)
-        for (int64_t c = 0; c < RGB; ++c)
-            for (int64_t half = 0; half < 2; ++half)
-                to[4 * half + c] =
-                    job->planes[0][((RGB * half + c) * job->rows + row) * job->columns + x];
 }
 
 /* Writes the light that squares receive from beyond kernels, and its share of white. */
@@ -441,9 +437,8 @@ static void spread_tails(spread_job *job) {
     pool_run(job->threads, (int)items, spread_tile, job);
     for (int level = job->n_levels - 2; level >= 0; --level) {
         raise_job own = {job, level};
-        pool_run(job->threads, (int)(2 * RGB * level_size(job->rows, level)), raise_row, &own);
+        pool_run(job->threads, (int)level_size(job->rows, level), raise_row, &own);
     }
-    pool_run(job->threads, (int)job->rows, interleave_row, job);
 }
 
 typedef struct {

@@ -596,5 +596,5 @@ class FrameRecord:
 
     def set_added_light(self, squares: NDArray[np.float32]) -> None:
         """Set light (rows, columns, 8) that is added, see `KernelTails`."""
-        self.c.squares = self._pointer_to(squares)
-        self.c.square_rows, self.c.square_columns = squares.shape[:2]
+        self.c.added.squares = self._pointer_to(squares)
+        self.c.added.rows, self.c.added.columns = squares.shape[:2]
