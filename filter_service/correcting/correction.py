@@ -376,6 +376,7 @@ class _Opener:
                 focus_dpt=self.state.focus_dpt,
                 output="linear",
                 merge=False,
+                bright_pixels=False,  # as in the operators
                 whole=True,
             )
         notes.extend(f"target's eye: {note}" for note in found.notes)

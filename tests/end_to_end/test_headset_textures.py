@@ -109,6 +109,7 @@ def test_pictures_are_those_of_arrays(context):
                 pupil_diameter_mm=state.pupil_diameter_mm,
                 focus_dpt=state.focus_dpt,
                 gaze_deg=last.frame.eyes[n].gaze_deg,
+                bright_pixels=False,  # as in textures
             )
         assert np.abs(found[n].astype(int) - expected.color).max() <= 1
         assert (found[n] != picture.color).any()

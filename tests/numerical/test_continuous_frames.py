@@ -14,7 +14,7 @@ from filter_service.constants import (
 from filter_service.rgbd_view import RgbdView
 from tests.numerical.made_fragments import made_fragments
 from tests.numerical.one_kernel import OneKernelBench, disc
-from tests.numerical.synthetic import Bench, texture
+from tests.numerical.synthetic import AS_DYNAMIC, Bench, texture
 
 pytestmark = pytest.mark.both_engines
 
@@ -165,7 +165,7 @@ def test_a_square_that_stops_merging_changes_no_pixel_at_once(gl_engine, spread_
         color = np.full((32, 32, 3), 0.4, np.float32)
         color[(X + Y)[:32, :32] % 2 == 0] += np.float32(ratio * limit)
         color[:, 24:] = 1.0  # white
-        return bench.render(color, output="linear")
+        return bench.render(color, output="linear", render_tolerance=AS_DYNAMIC)
 
     below, above = frame(1.0 - STEP_RATIO / 2.0), frame(1.0 + STEP_RATIO / 2.0)
     assert above.merged_count < below.merged_count == 32 * 32
