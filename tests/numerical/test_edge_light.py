@@ -265,6 +265,7 @@ def test_the_light_of_a_pixel_is_proportional_to_it(engine):
         seen(bench, lit(level))[Y, X + 12, 1] - without(bench, lit(level))[Y, X + 12, 1]
         for level in levels
     ]
+    # Squares of 4 px send 0.82 of it here, 12 px away; lamps alone 1.00 to 1.02.
     np.testing.assert_allclose(added / (levels - 1.0), added[-1] / 99.0, rtol=0.2)
 
 
