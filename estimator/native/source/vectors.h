@@ -204,6 +204,17 @@ INLINE f32x8 second_as_fourth8(f32x8 value) {
     return MIXED(value, value, 0, 1, 2, 1, 4, 5, 6, 5);
 }
 
+/* Lanes of a vector, by their number. */
+INLINE f32x8 lanes_of8(f32x8 value, i32x8 lanes) {
+#ifdef OCU_AVX2
+    return __builtin_ia32_permvarsf256(value, lanes);
+#else
+    f32x8 found;
+    for (int i = 0; i < 8; ++i) found[i] = value[lanes[i]];
+    return found;
+#endif
+}
+
 /* Eight 16-bit words as floats. */
 INLINE f32x8 floats_of(u16x8 words) {
     return __builtin_convertvector(__builtin_convertvector(words, i32x8), f32x8);

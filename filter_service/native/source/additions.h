@@ -141,8 +141,8 @@ INLINE void prefetch_row(const uint32_t *texels) {
     for (int n = 0; n < 3; ++n) __builtin_prefetch(from + 64 * n);
 }
 
-/* What members add: light, and coverage without or with `scales`; or light alone. */
-enum { PLAIN_COVERAGE, SCALED_COVERAGE, LIGHT_ALONE };
+/* What members add besides light: coverage without or with `scales`. */
+enum { PLAIN_COVERAGE, SCALED_COVERAGE };
 
 /* Adds members to `pairs` adjacent pairs of pixels, row by row: the sums of a row stay in
  * registers.  The compiler generates a loop for each number of pairs. */
@@ -187,8 +187,7 @@ INLINE void add_columns(const frame *f, const members *all, int count, const lev
 }
 
 /* Adds a cluster to a group of depths; fragments without a share in it are left out. */
-INLINE void add_cluster_as(const frame *f, uint32_t at, int32_t number, depth_group *group,
-                           int with_coverage) {
+static void add_cluster(const frame *f, uint32_t at, int32_t number, depth_group *group) {
     const cluster *from = f->clusters + at;
     const level_image *image = image_of(f, from->state);
     raster *own = group->sizes + image->resolution;
@@ -214,9 +213,7 @@ INLINE void add_cluster_as(const frame *f, uint32_t at, int32_t number, depth_gr
         }
 #define CASE(n)                                                                    \
     case n:                                                                        \
-        if (!with_coverage)                                                        \
-            add_columns(f, touch, count, image, own, pair, n, LIGHT_ALONE);        \
-        else if (all.is_plain)                                                     \
+        if (all.is_plain)                                                     \
             add_columns(f, touch, count, image, own, pair, n, PLAIN_COVERAGE);     \
         else                                                                       \
             add_columns(f, touch, count, image, own, pair, n, SCALED_COVERAGE);    \
@@ -224,15 +221,6 @@ INLINE void add_cluster_as(const frame *f, uint32_t at, int32_t number, depth_gr
         switch (pairs) { CASE(1) CASE(2) CASE(3) CASE(4) default: break; }
 #undef CASE
     }
-}
-
-static void add_cluster(const frame *f, uint32_t at, int32_t number, depth_group *group) {
-    add_cluster_as(f, at, number, group, 1);
-}
-
-/* The same without coverage. */
-static void add_light(const frame *f, uint32_t at, int32_t number, depth_group *group) {
-    add_cluster_as(f, at, number, group, 0);
 }
 
 /* Pairs and rows of a raster that a kernel's box overlaps. */

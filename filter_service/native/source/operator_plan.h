@@ -11,7 +11,14 @@
 #include "frame.h"
 #include "vectors.h"
 
-#define PAIR_FLOATS 8
+/* Rows of a bin in vectors of eight: red, green and blue of its pixels, one after another. */
+#define ROW_FLOATS (RGB * BIN_WIDTH)
+#define ROW_VECTORS (ROW_FLOATS / 8)
+
+/* Vectors of a row whose sums are kept in registers, and the texels of zeros that the rows of
+ * a kernel need, which may only touch them. */
+#define COLUMN_VECTORS 6
+#define PACKED_GAP_TEXELS (8 * COLUMN_VECTORS / RGB)
 
 /* Clusters of a bin whose light is multiplied by common factors. */
 typedef struct {
@@ -24,7 +31,7 @@ typedef struct {
 typedef struct {
     uint32_t *clusters;
     bin_part *parts;
-    float *factors;           /* of the rows of all parts: PAIRS_ACROSS pairs in each */
+    float *factors;           /* of the rows of all parts: ROW_FLOATS in each */
     float *weighted;          /* in the adjoint: the image times the factors */
     float *own;               /* share of each pixel's own color; NULL if there is none */
     int part_count;
@@ -37,8 +44,15 @@ typedef struct {
     bin_plan *bins;
     uint32_t *first_place;    /* of each cluster, and the end of the last */
     part_place *places;       /* of the parts that clusters light */
+    size_t *first_word;       /* of each kernel */
+    uint32_t *words;          /* of kernels: those of colors, without the means */
     int failed;               /* out of memory */
 } operator_plan;
+
+/* Words from one row of a kernel to the next. */
+INLINE ptrdiff_t packed_row(const level_image *image) {
+    return RGB * (ptrdiff_t)(image->width + PACKED_GAP_TEXELS);
+}
 
 /* Scratch of one thread: the parts of a bin before their factors are known. */
 typedef struct {
@@ -68,7 +82,7 @@ static bin_part *new_part(bin_draft *draft, int top, int bottom) {
         draft->parts = grown;
         draft->part_room = room;
     }
-    size_t needed = (size_t)(bottom - top) * PAIRS_ACROSS * PAIR_FLOATS;
+    size_t needed = (size_t)(bottom - top) * ROW_FLOATS;
     if (draft->share_count + needed > draft->share_room) {
         size_t room = 2 * (draft->share_count + needed);
         float *grown = realloc(draft->shares, sizeof *grown * room);
@@ -82,13 +96,25 @@ static bin_part *new_part(bin_draft *draft, int top, int bottom) {
     return part;
 }
 
+/* Writes the colors of two pixels. */
+INLINE void store_pair(float *to, f32x8 pair) {
+    for (int c = 0; c < RGB; ++c) {
+        to[c] = pair[c];
+        to[RGB + c] = pair[4 + c];
+    }
+}
+
+INLINE f32x8 load_pair(const float *from) {
+    return (f32x8){from[0], from[1], from[2], 0.0f, from[3], from[4], from[5], 0.0f};
+}
+
 /* Writes the shares that nearer depths leave of the open group, before it is closed. */
 static void write_shares(const window *w, const bin_part *part, float *to) {
     for (int i = part->top * PAIRS_ACROSS; i < part->bottom * PAIRS_ACROSS; ++i) {
         f32x8 most = larger8(w->open.sizes[0].pairs[i].coverage, all8(MIN_COVERAGE));
         f32x8 room = all8(1.0f) - w->near[i].coverage;
-        store8(to, smaller8(room / most, all8(1.0f)));
-        to += PAIR_FLOATS;
+        store_pair(to, smaller8(room / most, all8(1.0f)));
+        to += 2 * RGB;
     }
 }
 
@@ -169,23 +195,22 @@ static void write_factors(const bin_result *result, const bin_draft *draft, bin_
     int top = part.top, first_row = part.bottom, last_row = part.top;
     float *to = bin->factors + *count;
     for (int y = part.top; y < part.bottom; ++y) {
-        for (int x = 0; x < BIN_WIDTH; x += 2, shares += PAIR_FLOATS) {
+        for (int x = 0; x < BIN_WIDTH; x += 2, shares += 2 * RGB) {
             int pair = y * PAIRS_ACROSS + x / 2;
             f32x8 by_depth, all, factor = all8(0.0f);
             mixed_shares(result, x, y, &by_depth, &all);
             if (result->near != NULL)
-                factor = by_depth * load8(shares) * per_coverage(result->near[pair].coverage);
+                factor = by_depth * load_pair(shares) * per_coverage(result->near[pair].coverage);
             if (!is_hidden) factor += all * per_coverage(result->total[pair].coverage);
-            store8(to + ((y - top) * PAIRS_ACROSS + x / 2) * PAIR_FLOATS, factor);
+            store_pair(to + (y - top) * ROW_FLOATS + x * RGB, factor);
             if (is_dark8(factor)) continue;
             first_row = smaller_int(first_row, y);
             last_row = y + 1;
         }
     }
     if (first_row >= last_row) return;
-    size_t row_floats = PAIRS_ACROSS * PAIR_FLOATS;
-    size_t floats = (size_t)(last_row - first_row) * row_floats;
-    memmove(to, to + (size_t)(first_row - top) * row_floats, floats * sizeof *to);
+    size_t floats = (size_t)(last_row - first_row) * ROW_FLOATS;
+    memmove(to, to + (size_t)(first_row - top) * ROW_FLOATS, floats * sizeof *to);
     part.top = first_row;
     part.bottom = last_row;
     part.first_factor = *count;
@@ -196,8 +221,7 @@ static void write_factors(const bin_result *result, const bin_draft *draft, bin_
 /* Writes the shares of pixels' own color, where coverage is missing; false if memory ran
  * out. */
 static int write_own(const bin_result *result, bin_plan *bin) {
-    size_t count = BIN_HEIGHT * PAIRS_ACROSS * PAIR_FLOATS;
-    float own[BIN_HEIGHT * PAIRS_ACROSS * PAIR_FLOATS];
+    float own[BIN_HEIGHT * ROW_FLOATS];
     int any = 0;
     for (int y = 0; y < BIN_HEIGHT; ++y)
         for (int x = 0; x < BIN_WIDTH; x += 2) {
@@ -211,13 +235,13 @@ static int write_own(const bin_result *result, bin_plan *bin) {
                 lacks = (result->near[pair].coverage < least) & is_color;
                 share += (f32x8)((i32x8)by_depth & lacks);
             }
-            store8(own + pair * PAIR_FLOATS, share);
+            store_pair(own + y * ROW_FLOATS + x * RGB, share);
             any |= !is_dark8(share);
         }
     if (!any) return 1;
     bin->own = malloc(sizeof own);
     if (bin->own == NULL) return 0;
-    memcpy(bin->own, own, count * sizeof *own);
+    memcpy(bin->own, own, sizeof own);
     return 1;
 }
 
@@ -246,7 +270,7 @@ static int write_parts(const frame *f, const bin_result *result, const bin_draft
     float *factors = realloc(bin->factors, sizeof *factors * (count + 1));
     if (factors != NULL) bin->factors = factors;
     /* Aligned, as loads of pairs across cache lines take twice as long. */
-    bin->weighted = aligned_alloc(32, sizeof *factors * (count + PAIR_FLOATS));
+    bin->weighted = aligned_alloc(32, sizeof *factors * (count + 8));
     return bin->weighted != NULL && write_own(result, bin);
 }
 
@@ -328,6 +352,34 @@ static int list_places(const frame *f, operator_plan *plan) {
     return 1;
 }
 
+/* Copies the kernels of fragments, which are not merged, without the means; false if memory
+ * ran out. */
+static int pack_kernels(const frame *f, operator_plan *plan) {
+    size_t count = RGB * PACKED_GAP_TEXELS;
+    plan->first_word = malloc(sizeof *plan->first_word * (size_t)(f->kernel_count + 1));
+    if (plan->first_word == NULL) return 0;
+    for (int k = 0; k < f->kernel_count; ++k) {
+        plan->first_word[k] = count;
+        const level_image *image = f->kernels[k].level;
+        if (f->shapes[k].levels_used & 1) count += (size_t)(packed_row(image) * image->height);
+    }
+    plan->words = calloc(count + 8, sizeof *plan->words);
+    if (plan->words == NULL) return 0;
+    for (int k = 0; k < f->kernel_count; ++k) {
+        if (!(f->shapes[k].levels_used & 1)) continue;
+        const level_image *image = f->kernels[k].level;
+        const uint32_t *from = f->kernel_texels + 4 * (size_t)image->first_texel;
+        uint32_t *to = plan->words + plan->first_word[k];
+        for (int y = 0; y < image->height; ++y) {
+            for (int x = 0; x < image->width; ++x)
+                memcpy(to + RGB * x, from + 4 * x, RGB * sizeof *to);
+            from += 4 * row_texels(image);
+            to += packed_row(image);
+        }
+    }
+    return 1;
+}
+
 /* Frees a plan. */
 static void end_operator(int64_t address) {
     operator_plan *plan = (operator_plan *)(intptr_t)address;
@@ -342,6 +394,8 @@ static void end_operator(int64_t address) {
     free(plan->bins);
     free(plan->first_place);
     free(plan->places);
+    free(plan->first_word);
+    free(plan->words);
     free(plan);
 }
 
@@ -361,7 +415,7 @@ static int64_t new_operator(frame *f) {
         operator_job job = {.f = f, .plan = plan, .drafts = drafts};
         pool_run(f->threads, f->surface_count * f->block_rows, set_factors, f);
         pool_run(f->threads, plan->columns * plan->rows, plan_bin_item, &job);
-        failed = plan->failed || !list_places(f, plan);
+        failed = plan->failed || !list_places(f, plan) || !pack_kernels(f, plan);
         for (int thread = 0; thread < n_threads; ++thread) {
             free_list(&drafts[thread].list);
             free(drafts[thread].parts);
