@@ -46,10 +46,13 @@ from .profiles.parse import EyeProfile as EyeProfile
 from .profiles.parse import parse_profile as parse_profile
 from .profiles.parse import preset_names as preset_names
 from .profiles.parse import published_names as published_names
+from .profiles.synteyes import Biometry as Biometry
+from .profiles.synteyes import drawn_biometry as drawn_biometry
 from .profiles.typical_aberrations import PEOPLE_LIMITS as PEOPLE_LIMITS
 from .profiles.typical_aberrations import drawn_profiles as drawn_profiles
 from .profiles.typical_aberrations import drawn_text as drawn_text
 from .profiles.typical_aberrations import draws_axis as draws_axis
+from .profiles.typical_aberrations import draws_eye as draws_eye
 from .profiles.typical_aberrations import draws_periphery as draws_periphery
 from .psf.compute import compute_psf_batch as compute_psf_batch
 from .psf.compute import compute_psfs as compute_psfs

@@ -9,6 +9,7 @@ from estimator import MAX_PROFILE_BYTES as MAX_PROFILE_BYTES
 from estimator import PEOPLE_LIMITS as PEOPLE_LIMITS
 from estimator import PROFILE_SUFFIXES as PROFILE_SUFFIXES
 from estimator import Acuity as Acuity
+from estimator import Biometry as Biometry
 from estimator import DiffractiveRings as DiffractiveRings
 from estimator import DrawnFields as DrawnFields
 from estimator import EstimatedEye as EstimatedEye
@@ -33,10 +34,12 @@ from estimator import chromatic_refraction_dpt as chromatic_refraction_dpt
 from estimator import compute_psf_batch as compute_psf_batch
 from estimator import compute_psfs as compute_psfs
 from estimator import draw_section as draw_section
+from estimator import drawn_biometry as drawn_biometry
 from estimator import drawn_fields as drawn_fields
 from estimator import drawn_profiles as drawn_profiles
 from estimator import drawn_text as drawn_text
 from estimator import draws_axis as draws_axis
+from estimator import draws_eye as draws_eye
 from estimator import draws_periphery as draws_periphery
 from estimator import estimate_eye as estimate_eye
 from estimator import eye_model as eye_model

@@ -210,3 +210,25 @@ def drivers_log_s(angle_deg: float, age_years: ArrayLike) -> NDArray[np.float64]
     growth = 1.0 + (np.asarray(age_years, dtype=np.float64) / 65.0) ** 4
     log_s: NDArray[np.float64] = DRIVERS_LOG_S[angle_deg] + np.log10(growth)
     return log_s
+
+
+ROZEMA_PUPIL_MM = 5.0
+ROZEMA_EYES = 330
+ROZEMA_M_DPT = (-0.854, 2.42)
+ROZEMA_M_SKEWNESS = -0.72
+ROZEMA_UM = {
+    (3, -3): (-0.061, 0.111),
+    (3, -1): (-0.010, 0.139),
+    (3, 1): (-0.058, 0.118),
+    (3, 3): (0.004, 0.088),
+    (4, -4): (0.009, 0.038),
+    (4, -2): (0.002, 0.036),
+    (4, 0): (0.073, 0.080),
+    (4, 2): (0.006, 0.048),
+    (4, 4): (0.008, 0.049),
+}
+"""Mean and standard deviation of the spherical equivalent M, and of terms by (n, m) in
+the examiner's frame, of the wavefronts of 330 healthy right eyes, some of which are the
+eyes of SyntEyes (Rozema et al., Optom Vis Sci 94:680, 2017).  They are moments of the
+statistical model of these wavefronts, which https://github.com/neesingh/IRIS
+distributes as includes/eye_models/WF_Model_Data.mat."""

@@ -91,9 +91,9 @@ def drawn_profile(chance: random.Random) -> dict[str, Any]:
         body.pop(name, None)
     if (body.get("correction") or {}).get("cylinder_dpt"):
         body["correction"]["axis_deg"] = 90.0
-    if body["kind"] in ("surfaces", "pseudophakic", "published"):
+    if body["kind"] in ("surfaces", "pseudophakic", "published", "synteyes"):
         body.pop("correction", None)
-    if body["kind"] == "published":
+    if body["kind"] in ("published", "synteyes"):
         body.pop("retina", None)
     if body["kind"] == "surfaces":
         _settle_surfaces(body, chance)

@@ -51,6 +51,7 @@ from estimator import (
     drawn_fields,
     drawn_profiles,
     draws_axis,
+    draws_eye,
     perfect_transfer,
 )
 
@@ -378,7 +379,9 @@ def drawn_people(
     ValueError
         The count is not allowed, or persons with this profile do not differ.
     """
-    has_axis = draws_axis(study.profile) and study.far(ACUITY_PUPIL_MM).is_readable
+    has_axis = (draws_axis(study.profile) or draws_eye(study.profile)) and study.far(
+        ACUITY_PUPIL_MM
+    ).is_readable
     steps = (1 + has_axis) * count
     done = 0
 

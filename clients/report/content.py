@@ -91,6 +91,7 @@ KIND_LABELS = {
     "surfaces": "a given eye, by its surfaces",
     "pseudophakic": "biometry and the geometry of an implant",
     "published": "a schematic eye of the literature",
+    "synteyes": "an eye of a statistical model of biometry",
 }
 PAIR_MAP_MM, PAIR_CURVES_MM, PAIR_FIELD_MM, PAIR_SECTION_MM = 46.0, 49.0, 64.0, 50.0
 """Heights in the report of two eyes."""

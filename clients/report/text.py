@@ -27,6 +27,7 @@ from estimator import (
     WornLens,
     drawn_text,
     draws_axis,
+    draws_eye,
     draws_periphery,
 )
 
@@ -63,6 +64,8 @@ SOURCES = {
     "straylight": "Vos & van den Berg 1999 (CIE Research Note 135/1), van den Berg et "
     "al. 2007 (Am J Ophthalmol 144:358): light scattered in the eye",
     "cataract": "J Ophthalmol 2017:5649532: straylight of cataracts before surgery",
+    "synteyes": "Rozema, Rodriguez, Navarro & Tassignon 2016 (IOVS 57:683): SyntEyes, "
+    "a statistical model of the biometry of 312 eyes",
 }
 
 DESIGNS = {
@@ -286,7 +289,7 @@ def people_text(facts: EyeFacts) -> tuple[str, ...]:
             f"is accommodating through {ACUITY_PUPIL_MM:g} mm",
         )
     reason = "the axis is not drawn"
-    if draws_axis(profile):
+    if draws_axis(profile) or draws_eye(profile):
         reason = "they are not known through lenslets"
     return (f"{text}; contrast and acuity have no bands, because {reason}",)
 
@@ -439,6 +442,7 @@ def _drawn(study: EyeStudy, cite: Citations, people: DrawnPeople) -> tuple[str, 
         for name, is_drawn in (
             ("typical", draws_axis(study.profile)),
             ("periphery", draws_periphery(study.profile)),
+            ("synteyes", draws_eye(study.profile)),
         )
         if is_drawn
     ]

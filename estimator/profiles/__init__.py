@@ -17,6 +17,7 @@ presets.json         the six presets
 published/           schematic eyes with their sources
 measured_wavefront   a measurement used in closed form, without an eye model
 typical_aberrations  higher-order aberrations added to a prescription, by age or drawn
+synteyes             eyes drawn from a statistical model of biometry
 """
 
 import lazy_loader

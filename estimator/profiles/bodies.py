@@ -408,8 +408,8 @@ class CommonBody(Body, kw_only=True):
             Meta(
                 description="`people` (default): off-axis wavefronts of the measured "
                 "population; `model`: traced through the surfaces. Kinds `eye`, "
-                "`surfaces`, `pseudophakic` and `published`, and profiles with a "
-                "`retina`, always use `model`"
+                "`surfaces`, `pseudophakic`, `published` and `synteyes`, and profiles "
+                "with a `retina`, always use `model`"
             ),
         ]
         | UnsetType
@@ -560,5 +560,5 @@ MeasuredBody = PresetBody | PrescriptionBody | ZernikeBody | ZernikeSetBody | Ey
 
 MEASURED_KINDS = tuple(str(k.__struct_config__.tag) for k in get_args(MeasuredBody))
 
-TRACED_KINDS = ("pseudophakic", "published", "surfaces")
+TRACED_KINDS = ("pseudophakic", "published", "surfaces", "synteyes")
 """Kinds of `given_bodies`, read by tracing rays, with code that loads slowly."""

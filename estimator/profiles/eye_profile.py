@@ -72,7 +72,7 @@ class EyeProfile:
     eye : EyeParameters or None
         The eye itself, for kind ``eye``.
     surfaces : SurfaceModel or None
-        The eye itself, for kinds ``surfaces`` and ``published``.
+        The eye itself, for kinds that give it by surfaces (`bodies.TRACED_KINDS`).
     retina : RetinaShape or None
         Retina that replaces the sphere of radius eye length / 2.
     straylight : Straylight or None
@@ -88,8 +88,9 @@ class EyeProfile:
         Aberrations added to a traced eye (`typical_aberrations`); only a prescription
         requests any.
     sample : int or None
-        Seed of a person drawn from the population (`typical_aberrations`, `periphery`);
-        None for the typical aberrations and the most probable periphery.
+        Seed of a person drawn from a population (`typical_aberrations`, `periphery`,
+        `synteyes`); None for the typical aberrations and the most probable periphery,
+        or the mean eye.
     notes : tuple of str
         Notes on powers at their distance from the cornea, and at the cornea.
     """

@@ -407,6 +407,23 @@ class PublishedBody(CommonBody, kw_only=True, tag_field="kind", tag="published")
     name: Literal[PUBLISHED_NAMES]  # type: ignore[valid-type]  # names of files
 
 
+class SyntEyesBody(CommonBody, kw_only=True, tag_field="kind", tag="synteyes"):
+    """An eye drawn from SyntEyes, a statistical model of the biometry of people."""
+
+    sample: (
+        Annotated[
+            int,
+            Meta(
+                ge=0,
+                le=999_999,
+                description="seed of a person whose whole eye is drawn, with its "
+                "refraction; by default, the eye of the mean biometry",
+            ),
+        ]
+        | UnsetType
+    ) = UNSET
+
+
 ProfileBody = (
     PresetBody
     | PrescriptionBody
@@ -416,6 +433,7 @@ ProfileBody = (
     | SurfacesBody
     | PseudophakicBody
     | PublishedBody
+    | SyntEyesBody
 )
 """All bodies, told apart by their ``kind``."""
 

@@ -40,6 +40,7 @@ from estimator.profiles.common_fields import coefficients_um, common_fields
 from estimator.profiles.eye_profile import SURFACES_PUPIL_MM, EyeProfile
 from estimator.profiles.given_bodies import ImplantBody, PseudophakicBody
 from estimator.profiles.surfaces import published_eye, radii_mm, surface_model
+from estimator.profiles.synteyes import with_drawn_eye
 from estimator.profiles.validation import convert
 
 LABEL_INDEX = 1.336
@@ -301,7 +302,7 @@ IMPLANT_NOTE = Note(
 
 
 def parse_given_eye(data: object) -> EyeProfile:
-    """Parse a profile of kind ``surfaces``, ``pseudophakic`` or ``published``.
+    """Parse a profile of a kind of `bodies.TRACED_KINDS`.
 
     Raises
     ------
@@ -314,16 +315,26 @@ def parse_given_eye(data: object) -> EyeProfile:
             return _pseudophakic(body)
         case given_bodies.PublishedBody():
             return _published(body)
+        case given_bodies.SyntEyesBody():
+            return _synteyes(body)
     assert isinstance(body, given_bodies.SurfacesBody)
     return _with_surfaces(body, "surfaces", surface_model(body))
 
 
 def _published(body: given_bodies.PublishedBody) -> EyeProfile:
-    if body.retina is not None:
-        raise ProfileError(
-            "retina", "is part of a published eye", "null, or kind 'surfaces'"
-        )
+    _check_own_retina(body, "a published eye")
     return _with_surfaces(body, "published", published_eye(body.name).model)
+
+
+def _synteyes(body: given_bodies.SyntEyesBody) -> EyeProfile:
+    _check_own_retina(body, "an eye of SyntEyes")
+    sample = None if body.sample is msgspec.UNSET else body.sample
+    return with_drawn_eye(_with_surfaces(body, "synteyes", None), sample)
+
+
+def _check_own_retina(body: bodies.CommonBody, whose: str) -> None:
+    if body.retina is not None:
+        raise ProfileError("retina", f"is part of {whose}", "null, or kind 'surfaces'")
 
 
 def _pseudophakic(body: given_bodies.PseudophakicBody) -> EyeProfile:
@@ -351,7 +362,7 @@ def _pseudophakic(body: given_bodies.PseudophakicBody) -> EyeProfile:
 
 
 def _with_surfaces(
-    body: bodies.CommonBody, kind: str, surfaces: SurfaceModel
+    body: bodies.CommonBody, kind: str, surfaces: SurfaceModel | None
 ) -> EyeProfile:
     common = common_fields(body, kind)
     if kind != "pseudophakic" and replaces_lens(common["correction"]):

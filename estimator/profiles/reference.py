@@ -50,6 +50,8 @@ INTRODUCTIONS: dict[type[msgspec.Struct], str] = {
     "lens by its geometry.",
     given_bodies.ImplantBody: "`implant`.",
     given_bodies.PublishedBody: "Kind `published`: a schematic eye by its name.",
+    given_bodies.SyntEyesBody: "Kind `synteyes`: an eye drawn from a statistical model "
+    "of biometry.",
 }
 """Tables of the reference in their order, with the line above each."""
 

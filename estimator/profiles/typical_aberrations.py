@@ -288,8 +288,15 @@ def draws_periphery(profile: EyeProfile) -> bool:
     return not profile.is_given and profile.periphery == "people"
 
 
+def draws_eye(profile: EyeProfile) -> bool:
+    """Return whether drawn persons differ in the whole eye, with its refraction."""
+    return profile.kind == "synteyes"
+
+
 def drawn_text(profile: EyeProfile) -> str:
     """Describe the quantities that drawn persons share, and those that differ."""
+    if draws_eye(profile):
+        return "the whole eye, with its refraction, drawn from SyntEyes"
     drawn = []
     if draws_axis(profile):
         drawn.append("the higher orders on the axis")
@@ -320,10 +327,15 @@ def drawn_profiles(profile: EyeProfile, count: int) -> list[EyeProfile]:
     low, high = PEOPLE_LIMITS
     if not low <= count <= high:
         raise ValueError(f"people is {count}; allowed: {low} to {high}")
+    if draws_eye(profile):
+        from estimator.profiles.synteyes import with_drawn_eye  # loads slowly
+
+        return [with_drawn_eye(profile, k) for k in range(count)]
     if not (draws_axis(profile) or draws_periphery(profile)):
         raise ValueError(
             f"people: nothing to draw, because {_reason(profile)}; expected a "
-            "prescription, or a measured wavefront with 'periphery' people"
+            "prescription, a measured wavefront with 'periphery' people, or kind "
+            "'synteyes'"
         )
     return [replace(profile, sample=k) for k in range(count)]
 

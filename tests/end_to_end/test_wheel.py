@@ -39,6 +39,7 @@ HELD = (
     "estimator/estimate/eye_table.json",
     "estimator/profiles/published/*.json",
     "estimator/periphery/population.json",
+    "estimator/profiles/synteyes.json",
     "filter_service/PROTOCOL.md",
     "filter_service/*.schema.json",
     "filter_service/service/ocufilter.service",

@@ -25,6 +25,7 @@ IN_ORDER = (
     *("preset", "prescription", "zernike", "zernike_set", "eye", "surfaces"),
     "pseudophakic",
     "published",
+    "synteyes",
 )
 
 PAGE = (Path(messages.__file__).parent / "PROTOCOL.md").read_text(encoding="utf-8")
