@@ -25,7 +25,7 @@ from filter_service.planning.defocus_nodes import (
 from filter_service.planning.grid import GREEN
 from filter_service.planning.node_wavefronts import NodeWavefronts, PupilStates
 from filter_service.planning.nodes import PlanAxes, PlanNodes, RaggedNodes
-from filter_service.psfs.frame_layers import edge_reach_px, frame_layers
+from filter_service.psfs.frame_layers import blur_limits, edge_reach_px, frame_layers
 from filter_service.psfs.pack import StateReads
 from filter_service.psfs.store import PsfStore
 from filter_service.view_state import State
@@ -118,14 +118,16 @@ class ExactStore(PsfStore):
         used_layer_dpt = layer_dpt[max(first - 1, 0) : last + 2]
         nodes = self._nodes(pupil_mm, accommodation_dpt, zero_dpt, used_layer_dpt)
         self._add_nodes([(0, 0)], nodes)
+        reads = StateReads(np.zeros(1, np.int64), np.ones(1), np.ones(1))
         self.layers = replace(
             layers,
             layer_dpt=layer_dpt,
             field=change,
             layer_zero_dpt=zero_dpt,
-            reads=StateReads(np.zeros(1, np.int64), np.ones(1), np.ones(1)),
+            reads=reads,
             tables=self.tables,
             edge_reach_px=edge_reach_px(spec, pupil_mm),
+            limits=blur_limits(self, reads, zero_dpt, change),
         )
 
     def _nodes(

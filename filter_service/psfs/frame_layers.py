@@ -35,8 +35,30 @@ LAYER_SPACING = 0.97
 """Distance between layers in steps of the curves, which are interpolated: whole steps
 of them are 1.02 to 1.03 blur steps (means of the largest, six eyes)."""
 
+ROUNDING_DPT = 1e-9
+"""Rounding error of total defocus."""
+
 USUAL_LAYERS = 256
 """Layers of a frame that take one call of the C library; more take a second one."""
+
+
+@dataclass(frozen=True)
+class BlurLimits:
+    """Object distances of a state whose blur fits in the largest kernel.
+
+    Attributes
+    ----------
+    radius_px : int
+        Radius of the largest kernel.
+    low_dpt, high_dpt : (n_fields,)
+        Limits of object vergence per field node.  Kernels of objects beyond them are
+        those of the limit; if the first limit exceeds the second, all objects are
+        beyond.
+    """
+
+    radius_px: int
+    low_dpt: NDArray[np.float64]
+    high_dpt: NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -68,6 +90,8 @@ class FrameLayers:
         Pupil and focus that are reached; the gaze is not theirs.
     merge_spread_px : float
         Smallest spread of kernels that merged squares may use.
+    limits : BlurLimits or None
+        Distances whose blur fits in the largest kernel; None if it always fits.
     """
 
     layer_dpt: NDArray[np.float64]
@@ -82,6 +106,7 @@ class FrameLayers:
     blur_px_per_dpt: float
     notes: tuple[str, ...]
     merge_spread_px: float = MERGE_MIN_SPREAD_PX
+    limits: BlurLimits | None = None
 
     @cached_property
     def layer_blur_px(self) -> NDArray[np.float64]:
@@ -102,6 +127,39 @@ class FrameLayers:
         within = slice(max(first - 1, 0), last + 1)
         blur_px = float(self.layer_blur_px[within].max(initial=0.0))
         return min(int(np.ceil(blur_px + self.edge_reach_px)), max_px)
+
+    def limit_notes(
+        self, fields: NDArray[np.int64], low_dpt: float, high_dpt: float
+    ) -> tuple[str, ...]:
+        """Return a note if the blur of a frame exceeds the largest kernel.
+
+        Parameters
+        ----------
+        fields : (n, m)
+            Field nodes that the frame reads.
+        low_dpt, high_dpt : float
+            Object distances in the frame.
+        """
+        if self.limits is None:
+            return ()
+        limits, used = self.limits, np.unique(fields)
+        far_dpt, near_dpt = np.clip(
+            self.vergence.vergence_dpt(np.array([low_dpt, high_dpt])),
+            *self.vergence_range_dpt,
+        )
+        is_within = (
+            far_dpt >= limits.low_dpt[used].max() - ROUNDING_DPT
+            and near_dpt <= limits.high_dpt[used].min() + ROUNDING_DPT
+        )
+        if is_within:
+            return ()
+        note = Note(
+            "blur_limited",
+            "in part of the field, blur exceeds the largest kernel and is limited to a "
+            f"radius of {limits.radius_px} px",
+            radius_px=limits.radius_px,
+        )
+        return (note,)
 
 
 def frame_layers(
@@ -143,7 +201,6 @@ def frame_layers(
     layer_zero_dpt, change = _layer_zero_dpt(store, pupil_mm, accommodation_dpt)
     corners = _corners(plan, pupil_mm, accommodation_dpt)
     reads = _state_reads(store, pupil_mm, corners)
-    notes += _limit_notes(store, reads.groups)
     far_dpt, near_dpt = object_range_dpt or store.spec.object_range_dpt
     far_near_dpt = (
         float(eye.vergence.vergence_dpt(far_dpt)),
@@ -171,6 +228,41 @@ def frame_layers(
         blur_px_per_dpt=store.spec.blur_px_per_dpt(pupil_mm),
         notes=notes,
         merge_spread_px=merge_spread_px,
+        limits=blur_limits(store, reads, layer_zero_dpt, change),
+    )
+
+
+def blur_limits(
+    store: PsfStore,
+    reads: StateReads,
+    layer_zero_dpt: NDArray[np.float64],
+    change: FieldDefocus,
+) -> BlurLimits | None:
+    """Return the object distances of a state whose blur fits in the largest kernel.
+
+    Returns None if the nodes of the state end at no limit.  The parameters are those
+    of `FrameLayers`.
+    """
+    nodes, defocus = store.nodes, store.nodes.defocus
+    groups = reads.groups[:, None] + np.arange(store.fields_count)
+    is_limited = nodes.is_limited[groups]
+    if not is_limited.any():
+        return None
+    at_infinity_dpt = layer_zero_dpt + store.defocus.change_at_nodes_dpt(change)
+    ends = defocus.starts[groups], defocus.starts[groups + 1] - 1
+    low_dpt, high_dpt = (
+        (defocus.values_dpt[end][..., None] + nodes.channel_shift_dpt[groups])
+        / reads.scales[:, None, None]
+        - at_infinity_dpt
+        for end in ends
+    )
+    is_shrunk = nodes.shrink_ratio[groups] != 1.0
+    lows_dpt = np.where(is_shrunk, np.inf, low_dpt.max(axis=-1))
+    highs_dpt = np.where(is_shrunk, -np.inf, high_dpt.min(axis=-1))
+    return BlurLimits(
+        store.spec.max_blur_radius_px,
+        np.where(is_limited, lows_dpt, -np.inf).max(axis=0),
+        np.where(is_limited, highs_dpt, np.inf).min(axis=0),
     )
 
 
@@ -316,20 +408,6 @@ def _plane_ends_dpt(store: PsfStore, change: FieldDefocus) -> NDArray[np.float64
         return np.zeros(0)
     vergences_dpt = store.eye.vergence.vergence_dpt(np.array(ranges_dpt))
     return (vergences_dpt + change.range_dpt).ravel()
-
-
-def _limit_notes(store: PsfStore, groups: NDArray[np.int64]) -> tuple[str, ...]:
-    count = store.fields_count
-    if not any(store.nodes.is_limited[g : g + count].any() for g in groups.tolist()):
-        return ()
-    radius_px = store.spec.max_blur_radius_px
-    note = Note(
-        "blur_limited",
-        "in part of the field, blur exceeds the largest kernel and is limited to a "
-        f"radius of {radius_px} px",
-        radius_px=radius_px,
-    )
-    return (note,)
 
 
 def _usable_pupil(

@@ -97,14 +97,39 @@ def reach_px_of(view: RgbdView, layers: FrameLayers, image: ImageCells) -> int:
     The bound is computed from ray tracing plus diffraction within the box to which
     kernels are cropped.  It does not depend on which PSFs have been computed.
     """
-    depths_m = [m[m >= MIN_DEPTH_M] for m in view.surface_depths_m]
-    far_m = max((float(m.max(initial=0.0)) for m in depths_m), default=0.0)
-    near_m = min((float(m.min(initial=np.inf)) for m in depths_m), default=np.inf)
-    stretch_ratio = radial_stretch(view).max() if view.depth_kind == "planar" else 1.0
-    low_dpt = 1.0 / (far_m * stretch_ratio) if far_m > 0.0 else 0.0
-    high_dpt = 1.0 / near_m
+    low_dpt, high_dpt = distance_bounds_dpt(view)
     reach_px = layers.reach_px(low_dpt, high_dpt, max_px=MAX_REACH_PX)
     return ceil(image.maps.largest_stretch_ratio * reach_px)
+
+
+def distance_bounds_dpt(view: RgbdView) -> tuple[float, float]:
+    """Return bounds of the object distances of a view, as (low, high) dpt.
+
+    This takes a tenth of the time of `object_range_dpt`: planar depth counts as if it
+    were in the middle of the image or in its corner.
+    """
+    depths_m = []
+    for depth_m in view.surface_depths_m:
+        is_known = depth_m.min(initial=np.inf) >= MIN_DEPTH_M  # False with NaN
+        depths_m.append(depth_m if is_known else depth_m[depth_m >= MIN_DEPTH_M])
+    far_m = max(float(m.max(initial=0.0)) for m in depths_m)
+    near_m = min(float(m.min(initial=np.inf)) for m in depths_m)
+    stretch_ratio = 1.0
+    if view.depth_kind == "planar":
+        x_px = np.array([0, view.width_px - 1])
+        y_px = np.array([0, view.height_px - 1])
+        stretch_ratio = float(stretch_at(view, x_px, y_px[:, None]).max())
+    low_dpt = 1.0 / (far_m * stretch_ratio) if far_m > 0.0 else 0.0
+    return low_dpt, 1.0 / near_m
+
+
+def blur_notes(
+    view: RgbdView, layers: FrameLayers, image: ImageCells
+) -> tuple[str, ...]:
+    """Return a note if the blur of objects in a view exceeds the largest kernel."""
+    if layers.limits is None:
+        return ()
+    return layers.limit_notes(image.read_nodes, *distance_bounds_dpt(view))
 
 
 def map_images(

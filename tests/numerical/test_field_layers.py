@@ -207,7 +207,9 @@ def test_plans_end_where_kernels_may_not_grow():
     assert is_whole[:, :, *axis].all()
 
 
-def test_a_frame_says_where_its_blur_is_limited():
+@pytest.fixture(scope="module")
+def limited():
+    """An eye whose kernels may not grow to the blur of the nearest objects."""
     spec = spec_for(
         96,
         54,
@@ -219,8 +221,46 @@ def test_a_frame_says_where_its_blur_is_limited():
     # nearer than settings allow: much blur in an image of few pixels
     object.__setattr__(spec.settings, "object_range_dpt", (0.0, 40.0))
     eye = traced_eye("emmetropia", spec)
-    store = build_psf_store(eye, spec)
-    assert "limited to a radius of 6 px" in " ".join(
-        frame_layers(store, State(**STATE)).notes
+    return build_psf_store(eye, spec)
+
+
+def limit_notes(store, **range_dpt):
+    layers = frame_layers(store, State(**STATE))
+    fields = np.arange(store.fields_count)
+    return layers.limit_notes(fields, **range_dpt)
+
+
+def test_a_frame_says_where_its_blur_is_limited(limited):
+    (note,) = limit_notes(limited, low_dpt=0.0, high_dpt=40.0)
+    assert "limited to a radius of 6 px" in note
+    assert note.code == "blur_limited"
+    assert limited.reach_px.max() <= 6
+
+
+def test_a_frame_that_needs_no_limit_says_nothing_of_it(limited):
+    assert limit_notes(limited, low_dpt=0.5, high_dpt=0.5) == ()
+    assert limit_notes(limited, low_dpt=0.0, high_dpt=1.0) == ()
+
+
+def test_the_limit_is_where_rays_reach_the_largest_kernel(limited):
+    """Geometrical blur: a pupil of P mm and t dpt send rays P t / 2 mrad away."""
+    layers, spec = frame_layers(limited, State(**STATE)), limited.spec
+    axis = limited.plan.axis_node
+    pitch_mrad = min(spec.pixel_pitch_mrad)
+    rays_px = 0.5 * STATE["pupil_diameter_mm"] * layers.limits.high_dpt[axis]
+    assert rays_px / pitch_mrad == pytest.approx(0.86 * 6, rel=0.1)
+
+
+@pytest.mark.long("a frame is filtered by each engine")
+@pytest.mark.parametrize(("distance_m", "is_limited"), [(2.0, False), (0.026, True)])
+def test_both_engines_report_a_limit_only_where_a_frame_exceeds_it(
+    engine, limited, distance_m, is_limited
+):
+    renderer = engine.new_renderer()
+    view = RgbdView(
+        np.full((54, 96, 3), 128, np.uint8),
+        np.full((54, 96), distance_m, np.float32),
+        limited.spec.camera.tangents,
     )
-    assert store.reach_px.max() <= 6
+    notes = renderer.render(view, renderer.load(limited), **STATE).notes
+    assert ("blur_limited" in [note.code for note in notes]) == is_limited

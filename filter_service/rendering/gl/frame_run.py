@@ -26,6 +26,7 @@ from filter_service.gl.stage_timer import StageTimer
 from filter_service.psfs.frame_layers import FrameLayers
 from filter_service.rendering.engine import ViewRequest
 from filter_service.rendering.frame import (
+    blur_notes,
     border_px_of,
     drop_empty_layer,
     extended,
@@ -288,6 +289,12 @@ class FrameRun:
     def depth_m(self) -> NDArray[np.float32]:
         """Depth of the view, with missing depth filled in."""
         return self._view.depth_m
+
+    @property
+    def blur_notes(self) -> tuple[str, ...]:
+        """Return a note if blur of the view exceeds the largest kernel."""
+        cells = self._eye.handle.cells(self.timer, self._gaze_deg, self._cell_px)
+        return blur_notes(self._view, self.layers, cells)
 
     def finish(self) -> tuple[NDArray[Any], Counts] | MissingPsfs:
         """Return the image and the counts, or the PSFs that it lacks."""

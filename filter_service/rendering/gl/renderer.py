@@ -29,11 +29,13 @@ from filter_service.rendering.engine import (
     sampled_input_notes,
     with_exact_psfs,
 )
+from filter_service.rendering.frame import blur_notes
 from filter_service.rendering.frame_kernels import MissingPsfs
 from filter_service.rendering.gl.frame_run import EyeStates, FrameRun
 from filter_service.rendering.gl.gl_store import GlStore
 from filter_service.rendering.gl.texture_frames import TextureFrames
 from filter_service.rendering.perfect_eye import change_by_perfect_eye
+from filter_service.rgbd_view import RgbdView
 from filter_service.texture_view import TextureMemory, TextureSupport, TextureView
 
 
@@ -118,6 +120,11 @@ class FilterRenderer(OneView):
             layers, earlier = found
             counts: Mapping[str, Any] = {}
             notes = layers.notes + gaze_notes
+            if layers.limits is not None and earlier is not None:
+                image = request.handle.cells(request.times, gaze_deg)
+                sampled = earlier.sampled
+                view = RgbdView(sampled.color, sampled.depth_m, request.view.tangents)
+                notes += blur_notes(view, layers, image)
             if request.waits and earlier is not None:
                 self._gpu.check("render")
                 counts = earlier.counts
@@ -163,7 +170,10 @@ class FilterRenderer(OneView):
             state=replace(layers.state, gaze_deg=gaze_deg),
             **counts,
             layer_count=len(layers.layer_dpt),
-            notes=(*layers.notes, *gaze_notes, *input_notes(run.depth_m, *noted)),
+            notes=(
+                *(*layers.notes, *gaze_notes, *run.blur_notes),
+                *input_notes(run.depth_m, *noted),
+            ),
         )
 
 

@@ -29,6 +29,7 @@ from filter_service.rendering.engine import (
     with_exact_psfs,
 )
 from filter_service.rendering.frame import (
+    blur_notes,
     border_px_of,
     drop_empty_layer,
     extended,
@@ -294,6 +295,7 @@ class NativeRenderer(OneView):
         if isinstance(blended, MissingPsfs):
             return blended
         frame, plan, sizes, missing_count = blended
+        notes += blur_notes(view, layers, image)
         notes += input_notes(view.depth_m, missing_count, frame.c.bad_color_count)
         return Prepared(request, frame, plan, sizes, missing_count, state, notes)
 
