@@ -12,6 +12,7 @@ The package imports its modules only when their names are used.
     batch/           `ocufilter batch`: offline filtering of data sets
     headset/         `ocufilter headset`: a scene in an OpenXR headset
     natural_eye      eye whose pupil and focus follow light and distance
+    provenance       version, profile and state of the eye in the metadata of pictures
     frame_log        statistics of streams
     latency/         latency of frames through a running service
     pyrender_stream  streaming of a scene through a running service

@@ -7,7 +7,7 @@ display window and their shape, which the camera needs.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -170,13 +170,22 @@ def _noted_grid(image: _Exr, notes: list[str]) -> PixelGrid:
     return grid
 
 
-def write_exr(path: Path, linear_rgb: NDArray[Any], grid: PixelGrid | None) -> None:
-    """Write linear sRGB, with the place and shape of the pixels if they are given."""
+def write_exr(
+    path: Path,
+    linear_rgb: NDArray[Any],
+    grid: PixelGrid | None,
+    metadata: Mapping[str, str],
+) -> None:
+    """Write linear sRGB, with the place and shape of the pixels if they are given.
+
+    ``metadata`` becomes attributes; their names begin with a lowercase letter.
+    """
     import OpenEXR
 
     header: dict[str, Any] = {
         "compression": OpenEXR.ZIP_COMPRESSION,
         "type": OpenEXR.scanlineimage,
+        **{key[:1].lower() + key[1:]: text for key, text in metadata.items()},
     }
     if grid is not None:
         left, top, width, height = grid.window

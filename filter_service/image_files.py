@@ -13,6 +13,7 @@ import math
 import os
 import re
 import warnings
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, BinaryIO, NoReturn
@@ -20,6 +21,7 @@ from typing import Any, BinaryIO, NoReturn
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
+from PIL.PngImagePlugin import PngInfo
 
 from estimator.bounded_files import InvalidFile, printable, reason_of
 from filter_service.bounded_images import (
@@ -442,6 +444,7 @@ def write_image(
     *,
     png_level: int = 6,
     grid: PixelGrid | None = None,
+    metadata: Mapping[str, str] | None = None,
 ) -> None:
     """Write uint8 sRGB to ``.png``, or linear floats to ``.npy`` or ``.exr``.
 
@@ -452,6 +455,8 @@ def write_image(
         a fifth larger.
     grid : PixelGrid, optional
         Place and shape of the pixels, which only OpenEXR stores.
+    metadata : mapping, optional
+        ASCII text by key, which PNG (tEXt) and OpenEXR (string attributes) store.
 
     Raises
     ------
@@ -467,9 +472,12 @@ def write_image(
     if suffix == ".npy":
         np.save(path, image)
     elif suffix == ".exr":
-        write_exr(path, image, grid)
+        write_exr(path, image, grid, metadata or {})
     else:
-        Image.fromarray(image).save(path, compress_level=png_level)
+        chunks = PngInfo()
+        for key, text in (metadata or {}).items():
+            chunks.add_text(key, text)
+        Image.fromarray(image).save(path, compress_level=png_level, pnginfo=chunks)
 
 
 # --- file formats ------------------------------------------------------------

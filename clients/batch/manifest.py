@@ -26,6 +26,7 @@ from msgspec import ValidationError, convert, defstruct
 
 from clients.batch.source import SourceFrame
 from clients.frame_log import Notes, add_notes
+from clients.provenance import fingerprint
 from estimator import InvalidFile
 from estimator.bounded_files import loads_bounded
 from filter_service.atomic_files import PART_NAME, replace_atomically, write_atomically
@@ -157,12 +158,6 @@ _AS_TEXT: dict[str, Callable[[Any], Any]] = {
     "error": lambda error: error.encode("utf-8", "backslashreplace").decode(),
 }
 """Functions that make the values of a record text that JSON can hold."""
-
-
-def fingerprint(plain: Mapping[str, Any]) -> str:
-    """Return a hash of JSON-compatible values."""
-    text = json.dumps(plain, sort_keys=True)
-    return hashlib.sha256(text.encode()).hexdigest()
 
 
 class ManifestDiffers(InvalidFile):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,6 +21,7 @@ from clients.batch.work import (
     batch_settings,
 )
 from clients.commands.options import read_object
+from clients.provenance import folder_name, profile_name
 from estimator import InvalidFile, load_profile, profile_body, thread_count
 from filter_service.command_line import check_range, likely_number
 from filter_service.settings import (
@@ -33,7 +33,6 @@ from filter_service.settings import (
 
 Layout = Literal["auto", "tum", "nyu", "middlebury", "pairs", "video"]
 FPS_LIMITS_HZ = (0.1, 1000.0)
-_NAME = re.compile(r"[^\w.+-]+")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -262,12 +261,7 @@ def read_profiles(texts: Sequence[str]) -> dict[str, dict[str, Any]]:
         name, _, what = text.rpartition("=")
         body = profile_body(what)
         load_profile(what)  # raises if the profile is invalid
-        if what.lstrip().startswith("{"):  # JSON
-            own_name = str(body.get("name", "profile"))
-        else:
-            own_name = what if body.get("kind") == "preset" else Path(what).stem
-        name = name or own_name
-        name = _NAME.sub("_", name).lstrip(".")
+        name = folder_name(name) or profile_name(what, body)
         if not name or name in found:
             raise ValueError(
                 f"--profile '{text}': the name '{name}' is empty or already used; "

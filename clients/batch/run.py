@@ -10,8 +10,6 @@ import fcntl
 import math
 import os
 import re
-import shutil
-import subprocess
 import tempfile
 import time
 from collections import Counter
@@ -46,7 +44,6 @@ from clients.batch.source import SourceFrame
 from clients.batch.work import Job, Unit, UnitRunner
 from clients.frame_log import Notes, add_notes
 from estimator import InvalidFile, thread_count
-from filter_service import __version__
 
 UNIT_FRAMES = 16
 """Frames per unit of work: few enough that all workers finish at about the same time,
@@ -56,7 +53,6 @@ SEGMENT_FRAMES = 48
 """Frames per video segment. The number does not depend on the workers, because it
 determines the bytes of the video."""
 
-CHECKOUT = Path(__file__).resolve().parents[2]
 SEGMENTS = ".segments"
 VIDEO_SUFFIXES = (".mkv", ".mp4")
 LOCK = ".lock"
@@ -105,7 +101,7 @@ class Batch:
     def _described(self) -> dict[str, Any]:
         # Once, because code and videos may change during the run.
         return {
-            "made_by": code_version(),
+            "made_by": dict(self.job.made_by),
             "source": {
                 "name": text_of(self.source.resolve().name),
                 "layout": self.layout,
@@ -144,24 +140,6 @@ class Batch:
                 raise OSError(
                     f"'{path}' changed during the run; start again with --overwrite"
                 )
-
-
-def code_version() -> dict[str, str | None]:
-    """Return the version of the package and, in a checkout, its commit."""
-    return {"version": __version__, "commit": _commit()}
-
-
-def _commit() -> str | None:
-    if shutil.which("git") is None or not (CHECKOUT / ".git").exists():
-        return None
-    answer = subprocess.run(
-        ["git", "describe", "--always", "--dirty", "--abbrev=12"],
-        cwd=CHECKOUT,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    return answer.stdout.strip() or None
 
 
 def _identity(path: Path) -> tuple[int, ...]:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import hashlib
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 
 from clients.batch.manifest import COUNTS, Record, below, write_whole
 from clients.batch.source import BadFrame, Scaled, SourceFrame, States
+from clients.provenance import code_version, picture_metadata, profile_identity
 from estimator.bounded_files import read_bytes
 from filter_service import (
     Camera,
@@ -74,6 +76,8 @@ class Job:
         Rendering error relative to the default.
     rate_hz : float
         Frame rate of output videos.
+    made_by : mapping
+        Version and commit of the program.
     """
 
     profiles: Mapping[str, Mapping[str, Any]]
@@ -84,6 +88,7 @@ class Job:
     engine: Literal["native", "gl"] = "native"
     render_tolerance: float = 1.0
     rate_hz: float = 30.0
+    made_by: Mapping[str, str | None] = field(default_factory=code_version)
 
     @property
     def output(self) -> Output:
@@ -208,10 +213,20 @@ class UnitRunner:
         try:
             color, grid, record = self._filtered(profile, frame)
             start_s = time.perf_counter()
-            written = write_whole(
-                self._place(file),
-                lambda path: write_image(path, color, png_level=PNG_LEVEL, grid=grid),
+            metadata = picture_metadata(
+                self._job.made_by,
+                profile_identity(profile, self._job.profiles[profile]),
+                pupil_diameter_mm=record["pupil_mm"],
+                focus_dpt=record["focus_dpt"],
             )
+            write = partial(
+                write_image,
+                image=color,
+                png_level=PNG_LEVEL,
+                grid=grid,
+                metadata=metadata,
+            )
+            written = write_whole(self._place(file), write)
         except FAILURES as error:
             return _failed(profile, frame, error)
         record["ms"]["write"] = _ms_since(start_s)

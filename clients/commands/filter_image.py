@@ -11,6 +11,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from clients.commands.options import with_setting_options
+from clients.provenance import (
+    code_version,
+    picture_metadata,
+    profile_identity,
+    profile_name,
+)
 from filter_service.camera import read_intrinsics
 from filter_service.command_line import (
     Json,
@@ -188,7 +194,7 @@ def filter_image(
     )
     check_range("--render-tolerance", render_tolerance, (0.0, MAX_RENDER_TOLERANCE))
 
-    from estimator.profiles.files import load_profile
+    from estimator.profiles.files import load_profile, profile_body
     from filter_service import image_files
     from filter_service.atomic_files import replace_atomically
     from filter_service.rendering.frame import object_range_dpt
@@ -228,15 +234,25 @@ def filter_image(
             render_tolerance=render_tolerance,
             output=output,
         )
-    replace_atomically(
-        out, lambda part: image_files.write_image(part, filtered.seen.color, grid=grid)
+    body = profile_body(profile)
+    identity = profile_identity(profile_name(profile, body), body)
+    metadata = picture_metadata(
+        code_version(),
+        identity,
+        pupil_diameter_mm=filtered.seen.pupil_diameter_mm,
+        focus_dpt=filtered.seen.focus_dpt,
     )
+    write = partial(
+        image_files.write_image, image=filtered.seen.color, grid=grid, metadata=metadata
+    )
+    replace_atomically(out, write)
     whole_ms = 1e3 * (time.perf_counter() - started_s)
     summary = _summary(
         filtered,
         whole,
         out=out,
         eye=eye,
+        profile_sha256=identity["sha256"],
         view=view,
         object_dpt=object_dpt,
         whole_ms=whole_ms,
@@ -440,6 +456,7 @@ def _summary(
     *,
     out: Path,
     eye: "EyeProfile",
+    profile_sha256: str,
     view: "RgbdView",
     object_dpt: tuple[float, float],
     whole_ms: float,
@@ -450,9 +467,11 @@ def _summary(
     render_ms = sum(seen.stage_times_ms.values())
     return {
         "out": str(out),
+        "made_by": code_version(),
         "width_px": width_px,
         "height_px": height_px,
         "profile": eye.name,
+        "profile_sha256": profile_sha256,
         "pupil_diameter_mm": seen.pupil_diameter_mm,
         "focus_dpt": seen.focus_dpt,
         **seen.counts,

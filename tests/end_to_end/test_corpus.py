@@ -9,8 +9,7 @@ from dataclasses import asdict
 import msgpack
 import pytest
 
-from clients.batch.manifest import fingerprint
-from clients.batch.run import code_version
+from clients.provenance import code_version, fingerprint
 from estimator.profiles.files import load_profile
 from filter_service import messages
 from filter_service.protocol_schema import protocol_schema
