@@ -210,7 +210,8 @@ def make_files(folder: Path) -> None:
         (tum / name).mkdir(parents=True)
         image.resize((640, 480), Image.Resampling.NEAREST).save(tum / name / "1.0.png")
         (tum / f"{name}.txt").write_text(f"1.0 {name}/1.0.png\n")
-    for name in ("photo.jpg", "room.png"):
+    (folder / "photos").mkdir()
+    for name in ("photo.jpg", "room.png", "photos/a.jpg"):
         color.save(folder / name)
     np.save(folder / "room.npy", np.asarray(millimeters, np.float32) / 1000)
     for name, sphere_dpt in (("eye", -2), ("me", -1), ("before", -4), ("after", 0)):

@@ -6,6 +6,7 @@ into units, which workers run.  A manifest records the frames that are finished.
 program        the command
 options        command line
 source         a frame: its files, camera, depth format, and the state of the eye
+views          distances, pupils and foci in which each image is filtered
 layouts        detection of the layout of a data set, and videos
 datasets       pairs of images, TUM RGB-D, NYU depth v2, Middlebury stereo
 work           job and its units, which read, filter and write frames

@@ -63,6 +63,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clients.batch.source import (
+    Constant,
     Disparity,
     Optics,
     Pinhole,
@@ -198,6 +199,25 @@ def pair_frames(
     return frames
 
 
+def color_frames(
+    source: Path, optics: Optics, depth_form: Constant
+) -> list[SourceFrame]:
+    """Return the color images in a folder, whose depth is constant.
+
+    Raises
+    ------
+    ValueError
+        If two files have the same name.
+    """
+    folder = _sub_folder(source, COLOR_FOLDERS) or source
+    files = images_in(folder, COLOR_SUFFIXES)
+    colors = [path for path in files if not _DEPTH_WORD.search(path.stem)]
+    return [
+        SourceFrame(name, path, None, optics, depth_form)
+        for name, path in _named(colors, _COLOR_WORD).items()
+    ]
+
+
 def _colors_and_depths(
     source: Path, depth: Path | None
 ) -> tuple[dict[str, Path], dict[str, Path]]:
@@ -219,7 +239,8 @@ def _colors_and_depths(
         if len(depths) != len(colors):
             raise ValueError(
                 f"'{source}': cannot identify the depth files; allowed: folders such "
-                f"as color/ and depth/, names that end in _depth, or --depth DIR"
+                f"as color/ and depth/, names that end in _depth, --depth DIR, or "
+                "--distance-m"
             )
     return _named(colors, _COLOR_WORD), _named(depths, _DEPTH_WORD)
 

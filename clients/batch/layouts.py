@@ -15,6 +15,7 @@ from itertools import islice
 from pathlib import Path
 
 from clients.batch.datasets import (
+    color_frames,
     images_in,
     is_nyu,
     is_tum,
@@ -25,6 +26,7 @@ from clients.batch.datasets import (
     tum_frames,
 )
 from clients.batch.source import (
+    Constant,
     FieldOfView,
     Optics,
     Pinhole,
@@ -63,6 +65,7 @@ def list_frames(
     depth: Path | None = None,
     optics: Optics | None = None,
     depth_scale_m: float | None = None,
+    constant: Constant | None = None,
 ) -> tuple[str, list[SourceFrame]]:
     """Return the layout of a data set, and its frames in the order of their names.
 
@@ -78,6 +81,8 @@ def list_frames(
         Overrides the layout's camera.
     depth_scale_m : float, optional
         Meters per unit of the depth files; overrides the layout's scale.
+    constant : Constant, optional
+        Depth of all pixels; replaces depth files.
 
     Raises
     ------
@@ -86,6 +91,9 @@ def list_frames(
     """
     if not source.exists():
         raise ValueError(f"'{source}': no such file; allowed: a folder or a video")
+    if constant is not None and (depth or depth_scale_m) is not None:
+        name = "--depth" if depth is not None else "--depth-scale"
+        raise ValueError(f"--distance-m and {name} are given; allowed: one of them")
     layout = _layout_of(source, layout)
     if layout in DETECTED:
         if depth is not None:
@@ -96,13 +104,17 @@ def list_frames(
             "--fov-deg is not given, and the data set has no calibration; allowed: the "
             "vertical field of view in deg, or --intrinsics FX,FY,CX,CY in px"
         )
+    elif layout == "video":
+        frames = _video_frames(source, depth, optics, constant or Scaled(depth_scale_m))
+    elif constant is not None:
+        frames = color_frames(source, optics, constant)
     else:
-        listed = _video_frames if layout == "video" else pair_frames
-        scaled = Scaled(depth_scale_m)
-        frames = listed(source, depth, optics, scaled)
+        frames = pair_frames(source, depth, optics, Scaled(depth_scale_m))
     if not frames:
         raise ValueError(_nothing_found(source, layout, depth))
     _check_names(frames)
+    if constant is not None:
+        frames = [replace(one, depth=None, depth_form=constant) for one in frames]
     return layout, [_with_options(frame, optics, depth_scale_m) for frame in frames]
 
 
@@ -115,7 +127,8 @@ def _nothing_found(source: Path, layout: str, depth: Path | None) -> str:
     found = ", ".join(sorted(kinds)[:8]) or "none"
     allowed = (
         f"images ({', '.join(COLOR_SUFFIXES)}) in color/ and as many of depth "
-        f"({', '.join(DEPTH_SUFFIXES)}) in depth/, or names that end in _depth"
+        f"({', '.join(DEPTH_SUFFIXES)}) in depth/, names that end in _depth, or "
+        "--distance-m"
     )
     problem = f"no frames of the layout {layout}; files: {found}"
     return f"'{source}': {problem}; allowed: {allowed}"
@@ -143,20 +156,22 @@ def _layout_of(source: Path, layout: str) -> str:
 
 
 def _video_frames(
-    source: Path, depth: Path | None, optics: Optics, scaled: Scaled
+    source: Path, depth: Path | None, optics: Optics, depth_form: Scaled | Constant
 ) -> list[SourceFrame]:
     """Return the frames of a video, named by their numbers."""
     from clients.batch.video_reading import VideoReader
 
-    if depth is None:
+    if depth is None and not isinstance(depth_form, Constant):
         raise ValueError(
-            f"--depth is not given; allowed for '{source}': a 16-bit gray video, or a "
-            "folder of depth images"
+            f"--depth is not given; allowed for '{source}': a 16-bit gray video, a "
+            "folder of depth images, or --distance-m"
         )
     with VideoReader(source) as reader:
         count, times_s = reader.count, reader.variable_times_s
-    depths: list[tuple[Path, int | None]]
-    if depth.is_dir():
+    depths: list[tuple[Path | None, int | None]]
+    if depth is None:
+        depths = [(None, None)] * count
+    elif depth.is_dir():
         files = images_in(depth, DEPTH_SUFFIXES)
         depths = [(path, None) for path in files]
     elif depth.is_file():
@@ -175,7 +190,7 @@ def _video_frames(
             source,
             path,
             optics,
-            scaled,
+            depth_form,
             k,
             depth_index,
             time_s=None if times_s is None else times_s[k],

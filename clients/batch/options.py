@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,8 +11,10 @@ import typer
 
 from clients.batch.layouts import list_frames, optics_of
 from clients.batch.run import Batch
-from clients.batch.source import CENTER, SourceFrame, States, number_or_nan, read_states
+from clients.batch.source import Constant, SourceFrame, States, read_states
+from clients.batch.views import Views
 from clients.batch.work import (
+    FORMATS,
     LINEAR_FORMATS,
     VIDEO_FORMATS,
     Format,
@@ -22,17 +23,22 @@ from clients.batch.work import (
 )
 from clients.commands.options import read_object
 from clients.provenance import folder_name, profile_name
-from estimator import InvalidFile, load_profile, profile_body, thread_count
-from filter_service.command_line import check_range, likely_number
-from filter_service.settings import (
-    MAX_PUPIL_MM,
-    MAX_RENDER_TOLERANCE,
-    MAX_VERGENCE_DPT,
-    MIN_PUPIL_MM,
+from estimator import (
+    PEOPLE_LIMITS,
+    InvalidFile,
+    drawn_profiles,
+    load_profile,
+    parse_profile,
+    profile_body,
+    thread_count,
 )
+from filter_service.command_line import check_range
+from filter_service.settings import MAX_RENDER_TOLERANCE
 
 Layout = Literal["auto", "tum", "nyu", "middlebury", "pairs", "video"]
 FPS_LIMITS_HZ = (0.1, 1000.0)
+MAX_SAMPLE = 999_999
+"""Largest number of a drawn person."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,15 +84,46 @@ class BatchOptions:
     limit: Annotated[
         int | None, typer.Option(metavar="N", help="Use only the first N frames.")
     ] = None
-    pupil_mm: Annotated[float, typer.Option(help="Entrance pupil, mm.")] = 4.0
+    distance_m: Annotated[
+        str | None,
+        typer.Option(
+            metavar="M[,M...]",
+            help="Distance of all pixels, m, instead of depth files; inf is infinity.  "
+            "With several, each frame is filtered at each distance.",
+        ),
+    ] = None
+    pupil_mm: Annotated[
+        str,
+        typer.Option(
+            metavar="MM[,MM...]",
+            help="Entrance pupil, mm.  With several, each frame is filtered through "
+            "each pupil.",
+        ),
+    ] = "4"
     focus_dpt: Annotated[
         str,
         typer.Option(
-            metavar="DPT|center",
+            metavar="DPT|center[,...]",
             help="Focus distance, dpt, or the depth at the center of each frame; 0 is "
-            "infinity.",
+            "infinity.  With several, each frame is filtered at each focus.",
         ),
     ] = "0"
+    people: Annotated[
+        int | None,
+        typer.Option(
+            metavar="N",
+            help="Filter through N persons drawn from the population for each profile: "
+            "the higher orders of prescriptions, and the periphery.",
+        ),
+    ] = None
+    first_person: Annotated[
+        int,
+        typer.Option(
+            metavar="K",
+            help="Number of the first drawn person; a number is always the same "
+            "person.",
+        ),
+    ] = 0
     states: Annotated[
         Path | None,
         typer.Option(
@@ -168,20 +205,30 @@ def batch_of(options: BatchOptions) -> Batch:
         If an option is invalid.  The message names the option, the value and the range.
     """
     _check(options)
+    views = Views.of(options.distance_m, options.pupil_mm, options.focus_dpt)
     layout, frames = list_frames(
         options.source,
         options.layout,
         options.depth,
         optics_of(options.fov_deg, options.intrinsics),
         options.depth_scale,
+        Constant(views.distances_dpt[0]) if views.distances_dpt else None,
     )
     frames = frames[: options.limit]
     if options.fps is not None:
         frames = [replace(frame, time_s=None) for frame in frames]
-    states = _states(options, [frame.name for frame in frames])
+    if views.count > 1:
+        _check_several(options)
+    frames, states = views.of_frames(frames)
+    if options.states is not None:
+        states = _listed(options.states, states, [frame.name for frame in frames])
+    profiles = read_profiles(options.profile)
+    if options.people is not None:
+        profiles = drawn_people(profiles, options.people, options.first_person)
+    settings = read_object("--settings", options.settings)
     job = Job(
-        profiles=read_profiles(options.profile),
-        settings=batch_settings(read_object("--settings", options.settings), states),
+        profiles=profiles,
+        settings=batch_settings(settings, states, views.distances_dpt),
         states=states,
         format=options.format,
         half=options.half,
@@ -206,7 +253,8 @@ def workers_and_threads(options: BatchOptions) -> tuple[int, int]:
 
 def _check(options: BatchOptions) -> None:
     limits: Mapping[str, tuple[float, float]] = {
-        "pupil_mm": (MIN_PUPIL_MM, MAX_PUPIL_MM),
+        "people": PEOPLE_LIMITS,
+        "first_person": (0, MAX_SAMPLE),
         "render_tolerance": (0.0, MAX_RENDER_TOLERANCE),
         "limit": (1, float("inf")),
         "fps": FPS_LIMITS_HZ,
@@ -227,25 +275,58 @@ def _check(options: BatchOptions) -> None:
         raise ValueError(f"--out '{options.out}' is a file; allowed: a folder")
 
 
-def _states(options: BatchOptions, names: Sequence[str]) -> States:
-    focus_dpt: float | None = None
-    if options.focus_dpt != CENTER:
-        focus_dpt = number_or_nan(options.focus_dpt)
-        if not 0.0 <= focus_dpt <= MAX_VERGENCE_DPT:
-            hint = f"; allowed: 0 to {MAX_VERGENCE_DPT:g}"
-            if math.isnan(focus_dpt):
-                hint = likely_number(options.focus_dpt)
-            raise ValueError(
-                f"--focus-dpt is '{options.focus_dpt:.60}'{hint}, or {CENTER}"
-            )
-    listed = None
+def _check_several(options: BatchOptions) -> None:
+    """Check that frames may be filtered in several states."""
+    several = "several distances, pupils or foci"
     if options.states is not None:
-        if not options.states.is_file():
-            raise ValueError(f"--states '{options.states}': no such file")
-        listed = read_states(options.states, names)
-    states = States(options.pupil_mm, focus_dpt, listed)
+        raise ValueError(f"--states and {several} are given; allowed: one of them")
+    if options.format in VIDEO_FORMATS:
+        allowed = ", ".join(name for name in FORMATS if name not in VIDEO_FORMATS)
+        raise ValueError(
+            f"--format is {options.format}, with {several}; allowed: {allowed}"
+        )
+
+
+def _listed(path: Path, states: States, names: Sequence[str]) -> States:
+    """Return states with the values of a table."""
+    if not path.is_file():
+        raise ValueError(f"--states '{path}': no such file")
+    states = replace(states, listed=read_states(path, names))
     states.check(names)
     return states
+
+
+def drawn_people(
+    profiles: Mapping[str, Mapping[str, Any]], count: int, first: int
+) -> dict[str, dict[str, Any]]:
+    """Return profiles of persons drawn from the population, ``count`` for each profile.
+
+    Their names end in their numbers, from ``first`` on.
+
+    Raises
+    ------
+    ValueError
+        If persons with a profile do not differ.
+    """
+    last = first + count - 1
+    if last > MAX_SAMPLE:
+        raise ValueError(
+            f"--first-person is {first} with --people {count}; allowed: up to "
+            f"{MAX_SAMPLE - count + 1}"
+        )
+    digits = len(str(last))
+    found: dict[str, dict[str, Any]] = {}
+    for name, body in profiles.items():
+        drawn_profiles(parse_profile(body), count)  # raises if they do not differ
+        for number in range(first, last + 1):
+            found[f"{name}_{number:0{digits}d}"] = {**body, "sample": number}
+    clash = found.keys() & profiles.keys()
+    if clash or len(found) < count * len(profiles):
+        raise ValueError(
+            f"--people: names of profiles such as '{min(clash or found)}' are not "
+            "unique; allowed: NAME=PROFILE with other names"
+        )
+    return found
 
 
 def read_profiles(texts: Sequence[str]) -> dict[str, dict[str, Any]]:

@@ -68,8 +68,9 @@ def run(options: BatchOptions, *, quiet: bool) -> dict[str, Any]:
             Manifest(batch.out, batch.described()) as manifest,
             Progress("batch", quiet=quiet) as progress,
         ):
+            names = list(batch.job.profiles)
             task = progress.task(
-                ", ".join(batch.job.profiles),
+                names[0] if len(names) == 1 else f"{len(names)} profiles",
                 total=len(batch.frames) * len(batch.job.profiles),
             )
             return run_batch(

@@ -119,7 +119,7 @@ class Batch:
         paths = {
             path
             for frame in self.frames
-            for path in {frame.color, frame.depth} - set(frame.files)
+            for path in frame.videos
             if frame.fault is None
         }
         return {

@@ -127,6 +127,19 @@ class Disparity:
 
 
 @dataclass(frozen=True)
+class Constant:
+    """Depth that is the same in all pixels: 1 / distance, 0 at infinity."""
+
+    distance_dpt: float
+
+    def like(self, color: ImageFile) -> ImageFile:
+        """Return the depth of a color image, m."""
+        distance_m = 1.0 / self.distance_dpt if self.distance_dpt > 0.0 else math.inf
+        pixels = np.full(color.pixels.shape[:2], distance_m, np.float32)
+        return ImageFile(pixels, color.grid)
+
+
+@dataclass(frozen=True)
 class SourceFrame:
     """A frame of a data set.
 
@@ -134,11 +147,13 @@ class SourceFrame:
     ----------
     name : str
         Unique name of the results, a relative path without a suffix.
-    color, depth : Path
-        Files of the images, or videos.
+    color : Path
+        File of the image, or video.
+    depth : Path or None
+        File or video of depth; None if the depth is constant.
     optics : Optics
         Camera.
-    depth_form : DepthForm
+    depth_form : DepthForm or Constant
         Depth format.
     color_index, depth_index : int, optional
         Frame numbers in videos.
@@ -150,9 +165,9 @@ class SourceFrame:
 
     name: str
     color: Path
-    depth: Path
+    depth: Path | None
     optics: Optics
-    depth_form: DepthForm
+    depth_form: DepthForm | Constant
     color_index: int | None = None
     depth_index: int | None = None
     time_s: Fraction | None = None
@@ -162,7 +177,13 @@ class SourceFrame:
     def files(self) -> tuple[Path, ...]:
         """Return the image files of the frame, without videos."""
         parts = ((self.color, self.color_index), (self.depth, self.depth_index))
-        return tuple(path for path, index in parts if index is None)
+        return tuple(path for path, index in parts if path and index is None)
+
+    @property
+    def videos(self) -> tuple[Path, ...]:
+        """Return the videos of the frame."""
+        parts = ((self.color, self.color_index), (self.depth, self.depth_index))
+        return tuple(path for path, index in parts if path and index is not None)
 
     def described(self) -> dict[str, Any]:
         """Return the camera and the depth format, for JSON."""
@@ -215,7 +236,7 @@ class States:
     focus_dpt : float or None
         Focus of frames whose focus is not listed; None is the depth at the center.
     listed : dict, optional
-        (pupil_mm, focus_dpt) by frame name; a missing column is None.
+        (pupil_mm, focus_dpt) by frame name; None is the value for all frames.
     """
 
     pupil_mm: float
@@ -248,7 +269,9 @@ class States:
     def _range(self, column: int, usual: tuple[float, float]) -> tuple[float, float]:
         values = [state[column] for state in (self.listed or {}).values()]
         known = [value for value in values if value is not None]
-        return (min(known), max(known)) if known else usual
+        if len(known) < len(values) or not known:
+            known += usual
+        return min(known), max(known)
 
     def described(self) -> dict[str, Any]:
         """Return the parameters that determine the states, for JSON."""

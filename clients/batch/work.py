@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clients.batch.manifest import COUNTS, Record, below, write_whole
-from clients.batch.source import BadFrame, Scaled, SourceFrame, States
+from clients.batch.source import BadFrame, Constant, Scaled, SourceFrame, States
 from clients.provenance import code_version, picture_metadata, profile_identity
 from estimator.bounded_files import read_bytes
 from filter_service import (
@@ -35,6 +35,7 @@ from filter_service.image_files import (
     read_color_file,
     write_image,
 )
+from filter_service.settings import MAX_PLANES
 
 if TYPE_CHECKING:
     from clients.batch.video_reading import VideoReader
@@ -116,7 +117,9 @@ class Job:
         }
 
 
-def batch_settings(given: Mapping[str, Any], states: States) -> FilterSettings:
+def batch_settings(
+    given: Mapping[str, Any], states: States, distances_dpt: Sequence[float] = ()
+) -> FilterSettings:
     """Return the settings of a batch.
 
     Parameters
@@ -126,6 +129,8 @@ def batch_settings(given: Mapping[str, Any], states: States) -> FilterSettings:
         to include the states.
     states : States
         Pupil and focus of each frame.
+    distances_dpt : sequence of float
+        Distances of all objects, if the frames have no other depth.
 
     Raises
     ------
@@ -136,10 +141,15 @@ def batch_settings(given: Mapping[str, Any], states: States) -> FilterSettings:
         settings = FilterSettings(**given)
     except TypeError as error:
         raise ValueError(f"--settings: {error}") from None
-    return settings.covering(
+    settings = settings.covering(
         pupils_mm=() if "pupil_range_mm" in given else states.pupil_range_mm,
         foci_dpt=() if "focus_range_dpt" in given else states.focus_range_dpt,
     )
+    if not distances_dpt or "object_range_dpt" in given or "object_planes_dpt" in given:
+        return settings
+    if len(distances_dpt) <= MAX_PLANES:
+        return settings.changed(object_planes_dpt=tuple(sorted(distances_dpt)))
+    return settings.covering(objects_dpt=tuple(distances_dpt))
 
 
 class EngineUnusable(RuntimeError):
@@ -384,6 +394,9 @@ class UnitRunner:
             color = read_color_file(frame.color, option="", content=content)
         else:
             color = self._reader(frame.color).color(frame.color_index)
+        if isinstance(frame.depth_form, Constant):
+            return color, frame.depth_form.like(color), inputs
+        assert frame.depth is not None
         if frame.depth_index is None:
             content = content_of(frame.depth)
             return color, frame.depth_form.read(frame.depth, content), inputs
@@ -423,7 +436,7 @@ def _failed(profile: str, frame: SourceFrame, error: BaseException) -> Record:
         "frame": frame.name,
         "ok": False,
         "error": text,
-        "files": [frame.color.name, frame.depth.name],
+        "files": [path.name for path in (frame.color, frame.depth) if path],
     }
 
 
