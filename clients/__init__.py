@@ -10,6 +10,7 @@ The package imports its modules only when their names are used.
     service_process  service in a child process
     hello            minimal client
     batch/           `ocufilter batch`: offline filtering of data sets
+    stimuli/         optotypes, gratings, noise and text of exact angular size
     headset/         `ocufilter headset`: a scene in an OpenXR headset
     natural_eye      eye whose pupil and focus follow light and distance
     provenance       version, profile and state of the eye in the metadata of pictures

@@ -1,3 +1,4 @@
+from . import stimuli as stimuli
 from .filter_client import FilterClient as FilterClient
 from .filter_client import FilteredFrame as FilteredFrame
 from .service_process import ServiceProcess as ServiceProcess

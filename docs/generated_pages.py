@@ -71,10 +71,15 @@ def _api_page() -> str:
         module = importlib.import_module(package)
         for name in sorted(module.__all__, key=str.lower):
             found = getattr(module, name)
+            if inspect.ismodule(found):  # a section of its own
+                continue
             is_code = inspect.isclass(found) or inspect.isroutine(found)
             if is_code and not inspect.getdoc(found):
                 raise PluginError(f"{package}.{name} has no docstring")
             lines += [f"::: ocufilter.{name}", ""]
+    lines += ["## Draw stimuli", "", "As in `from ocufilter import stimuli`.", ""]
+    for name in importlib.import_module("clients.stimuli").__all__:
+        lines += [f"::: clients.stimuli.{name}", ""]
     lines += ["## Differentiate in PyTorch", "", "::: ocufilter.torch.SeeThrough", ""]
     return "\n".join(lines)
 

@@ -3,6 +3,7 @@
 from clients import FilterClient as FilterClient
 from clients import FilteredFrame as FilteredFrame
 from clients import ServiceProcess as ServiceProcess
+from clients import stimuli as stimuli
 
 # estimate an eye; compute its wavefronts and PSFs
 from estimator import MAX_PROFILE_BYTES as MAX_PROFILE_BYTES

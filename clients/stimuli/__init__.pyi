@@ -1,0 +1,10 @@
+from .display import Display as Display
+from .letters import landolt_c as landolt_c
+from .letters import reading_text as reading_text
+from .letters import sloan_letters as sloan_letters
+from .letters import tumbling_e as tumbling_e
+from .patterns import edge as edge
+from .patterns import gabor as gabor
+from .patterns import grating as grating
+from .patterns import noise as noise
+from .stimulus import Stimulus as Stimulus

@@ -1,0 +1,101 @@
+"""The light of a stimulus, its parameters, and the contrast that its pixels have."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clients.stimuli.display import Display
+from filter_service import RgbdView
+from filter_service.color_encoding import srgb8_of
+
+ROUNDING = 1e-9
+"""Rounding error of light."""
+
+
+@dataclass(frozen=True)
+class Stimulus:
+    """A gray picture in linear light.
+
+    Attributes
+    ----------
+    name : str
+        Name from its parameters, for a file.
+    light : (height, width), float32
+        Linear light; 0 is black, 1 is white.
+    display : Display
+        Pixels and their visual angle.
+    parameters : dict
+        Parameters by name.
+    notes : tuple of str
+        Problems of the sampling.
+    """
+
+    name: str
+    light: NDArray[np.float32]
+    display: Display
+    parameters: Mapping[str, Any]
+    notes: tuple[str, ...] = field(default=())
+
+    @property
+    def linear_rgb(self) -> NDArray[np.float32]:
+        """Linear light (height, width, 3)."""
+        return np.repeat(self.light[..., None], 3, axis=2)
+
+    @property
+    def srgb(self) -> NDArray[np.uint8]:
+        """8-bit sRGB (height, width, 3)."""
+        return srgb8_of(self.linear_rgb)
+
+    def view(self, distance_m: float) -> RgbdView:
+        """Return what an eye sees at a distance: the linear light, and its depth."""
+        depth_m = np.full(self.light.shape, distance_m, np.float32)
+        return RgbdView(self.linear_rgb, depth_m, self.display.camera.tangents)
+
+    def described(self) -> dict[str, Any]:
+        """Return parameters, measured light and notes, for JSON.
+
+        Mean, least and most light and the Michelson contrast are those of the pixels.
+        """
+        light = self.light.astype(np.float64)
+        low, high = float(light.min()), float(light.max())
+        measured = {"mean": float(light.mean()), "least": low, "most": high}
+        total = low + high
+        found = {
+            "name": self.name,
+            **self.parameters,
+            "light_ratio": measured,
+            "michelson_contrast": (high - low) / total if total > 0.0 else 0.0,
+            "notes": list(self.notes),
+        }
+        if (white := self.display.white_cd_m2) is not None:
+            found["luminance_cd_m2"] = {k: white * v for k, v in measured.items()}
+        return found
+
+
+def stimulus(
+    name: str,
+    light: NDArray[np.float64],
+    display: Display,
+    parameters: Mapping[str, Any],
+    notes: tuple[str, ...] = (),
+) -> Stimulus:
+    """Return a stimulus, or raise if its light is beyond black or white.
+
+    Raises
+    ------
+    ValueError
+        If it is.  The message names the range of the light.
+    """
+    low, high = float(light.min()), float(light.max())
+    if low < -ROUNDING or high > 1.0 + ROUNDING:
+        raise ValueError(
+            f"the light of {name} is {low:.4g} to {high:.4g}; allowed: 0 (black) to 1 "
+            "(white), by less contrast or another mean or background"
+        )
+    clipped = np.clip(light, 0.0, 1.0).astype(np.float32)
+    return Stimulus(name, clipped, display, dict(parameters), notes)
