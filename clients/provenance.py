@@ -94,15 +94,20 @@ def picture_metadata(
     profile : mapping
         As `profile_identity` returns.
     """
-    commit = made_by.get("commit")
-    software = f"ocufilter {made_by.get('version')}"
     facts = {
-        **made_by,
         "profile": dict(profile),
         "pupil_diameter_mm": pupil_diameter_mm,
         "focus_dpt": focus_dpt,
     }
+    return metadata_of(made_by, facts)
+
+
+def metadata_of(
+    made_by: Mapping[str, str | None], facts: Mapping[str, Any]
+) -> dict[str, str]:
+    """Return the program and JSON-compatible facts as metadata, as text by key."""
+    commit, software = made_by.get("commit"), f"ocufilter {made_by.get('version')}"
     return {
         "Software": f"{software} ({commit})" if commit else software,
-        METADATA_KEY: json.dumps(facts),
+        METADATA_KEY: json.dumps({**made_by, **facts}),
     }

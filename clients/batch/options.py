@@ -42,15 +42,78 @@ MAX_SAMPLE = 999_999
 
 
 @dataclass(frozen=True, kw_only=True)
-class BatchOptions:
-    """Options of the command line."""
+class EyeOptions:
+    """Options of commands that filter sets of images through several eyes."""
+
+    out: Annotated[
+        Path, typer.Option("--out", "-o", metavar="DIR", help="Output folder.")
+    ]
+    pupil_mm: Annotated[
+        str,
+        typer.Option(
+            metavar="MM[,MM...]",
+            help="Entrance pupil, mm.  With several, each frame is filtered through "
+            "each pupil.",
+        ),
+    ] = "4"
+    people: Annotated[
+        int | None,
+        typer.Option(
+            metavar="N",
+            help="Filter through N persons drawn from the population for each profile: "
+            "the higher orders of prescriptions, and the periphery.",
+        ),
+    ] = None
+    first_person: Annotated[
+        int,
+        typer.Option(
+            metavar="K",
+            help="Number of the first drawn person; a number is always the same "
+            "person.",
+        ),
+    ] = 0
+    settings: Annotated[
+        str,
+        typer.Option(
+            metavar="JSON",
+            help='Settings such as {"mode": "quality", "object_range_dpt": [0, 5]}.',
+        ),
+    ] = "{}"
+    render_tolerance: Annotated[
+        float,
+        typer.Option(
+            help="Rendering error relative to the default; 0 is exact but slow."
+        ),
+    ] = 1.0
+    overwrite: Annotated[
+        bool,
+        typer.Option(
+            "--overwrite", help="Delete the output of another job in the folder."
+        ),
+    ] = False
+    workers: Annotated[
+        int | None, typer.Option(help="Number of processes; by default one per core.")
+    ] = None
+    threads: Annotated[
+        int | None,
+        typer.Option(help="Threads per worker; by default cores / workers."),
+    ] = None
+    engine: Annotated[
+        Literal["native", "gl"],
+        typer.Option(
+            help="native: CPU, with the same results on all machines; gl: GPU, with "
+            "one worker by default."
+        ),
+    ] = "native"
+
+
+@dataclass(frozen=True, kw_only=True)
+class BatchOptions(EyeOptions):
+    """Options of `ocufilter batch`."""
 
     source: Annotated[
         Path,
         typer.Argument(metavar="INPUT", help="Folder or video."),
-    ]
-    out: Annotated[
-        Path, typer.Option("--out", "-o", metavar="DIR", help="Output folder.")
     ]
     profile: Annotated[
         list[str],
@@ -92,14 +155,6 @@ class BatchOptions:
             "With several, each frame is filtered at each distance.",
         ),
     ] = None
-    pupil_mm: Annotated[
-        str,
-        typer.Option(
-            metavar="MM[,MM...]",
-            help="Entrance pupil, mm.  With several, each frame is filtered through "
-            "each pupil.",
-        ),
-    ] = "4"
     focus_dpt: Annotated[
         str,
         typer.Option(
@@ -108,22 +163,6 @@ class BatchOptions:
             "infinity.  With several, each frame is filtered at each focus.",
         ),
     ] = "0"
-    people: Annotated[
-        int | None,
-        typer.Option(
-            metavar="N",
-            help="Filter through N persons drawn from the population for each profile: "
-            "the higher orders of prescriptions, and the periphery.",
-        ),
-    ] = None
-    first_person: Annotated[
-        int,
-        typer.Option(
-            metavar="K",
-            help="Number of the first drawn person; a number is always the same "
-            "person.",
-        ),
-    ] = 0
     states: Annotated[
         Path | None,
         typer.Option(
@@ -132,19 +171,6 @@ class BatchOptions:
             "focus_dpt.",
         ),
     ] = None
-    settings: Annotated[
-        str,
-        typer.Option(
-            metavar="JSON",
-            help='Settings such as {"mode": "quality", "object_range_dpt": [0, 5]}.',
-        ),
-    ] = "{}"
-    render_tolerance: Annotated[
-        float,
-        typer.Option(
-            help="Rendering error relative to the default; 0 is exact but slow."
-        ),
-    ] = 1.0
     format: Annotated[
         Format,
         typer.Option(
@@ -160,32 +186,12 @@ class BatchOptions:
             help="Frame rate of videos; by default the times of the input video, or 30."
         ),
     ] = None
-    overwrite: Annotated[
-        bool,
-        typer.Option(
-            "--overwrite", help="Delete the output of another job in the folder."
-        ),
-    ] = False
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Estimate time and cost, then stop.")
     ] = False
     price_per_core_hour: Annotated[
         float | None, typer.Option(metavar="X", help="Price for --dry-run.")
     ] = None
-    workers: Annotated[
-        int | None, typer.Option(help="Number of processes; by default one per core.")
-    ] = None
-    threads: Annotated[
-        int | None,
-        typer.Option(help="Threads per worker; by default cores / workers."),
-    ] = None
-    engine: Annotated[
-        Literal["native", "gl"],
-        typer.Option(
-            help="native: CPU, with the same results on all machines; gl: GPU, with "
-            "one worker by default."
-        ),
-    ] = "native"
     ray: Annotated[
         str | None,
         typer.Option(
@@ -204,7 +210,14 @@ def batch_of(options: BatchOptions) -> Batch:
     ValueError
         If an option is invalid.  The message names the option, the value and the range.
     """
-    _check(options)
+    check_options(
+        options,
+        limit=(1, float("inf")),
+        fps=FPS_LIMITS_HZ,
+        price_per_core_hour=(0.0, float("inf")),
+        depth_scale=(1e-9, 1e9),
+    )
+    _check_format(options)
     views = Views.of(options.distance_m, options.pupil_mm, options.focus_dpt)
     layout, frames = list_frames(
         options.source,
@@ -222,9 +235,7 @@ def batch_of(options: BatchOptions) -> Batch:
     frames, states = views.of_frames(frames)
     if options.states is not None:
         states = _listed(options.states, states, [frame.name for frame in frames])
-    profiles = read_profiles(options.profile)
-    if options.people is not None:
-        profiles = drawn_people(profiles, options.people, options.first_person)
+    profiles = profiles_of(options, options.profile)
     settings = read_object("--settings", options.settings)
     job = Job(
         profiles=profiles,
@@ -239,7 +250,7 @@ def batch_of(options: BatchOptions) -> Batch:
     return Batch(job, layout, options.source, frames, options.out)
 
 
-def workers_and_threads(options: BatchOptions) -> tuple[int, int]:
+def workers_and_threads(options: EyeOptions) -> tuple[int, int]:
     """Return the number of processes, and of threads in each.
 
     One process per core filters more frames than one process with as many threads
@@ -251,28 +262,40 @@ def workers_and_threads(options: BatchOptions) -> tuple[int, int]:
     return n_workers, options.threads or max(1, n_cores // n_workers)
 
 
-def _check(options: BatchOptions) -> None:
-    limits: Mapping[str, tuple[float, float]] = {
+def check_options(options: EyeOptions, **limits: tuple[float, float]) -> None:
+    """Check the numbers of options, and that the output is not a file.
+
+    Parameters
+    ----------
+    **limits
+        Limits of options besides those of `EyeOptions`.
+
+    Raises
+    ------
+    ValueError
+        If a number is out of range.  The message names the option.
+    """
+    limits = {
         "people": PEOPLE_LIMITS,
         "first_person": (0, MAX_SAMPLE),
         "render_tolerance": (0.0, MAX_RENDER_TOLERANCE),
-        "limit": (1, float("inf")),
-        "fps": FPS_LIMITS_HZ,
         "workers": (1, 1024),
         "threads": (1, 256),
-        "price_per_core_hour": (0.0, float("inf")),
-        "depth_scale": (1e-9, 1e9),
+        **limits,
     }
     for name, (low, high) in limits.items():
         value = getattr(options, name)
         if value is not None:
             check_range(f"--{name.replace('_', '-')}", value, (low, high))
+    if options.out.exists() and not options.out.is_dir():
+        raise ValueError(f"--out '{options.out}' is a file; allowed: a folder")
+
+
+def _check_format(options: BatchOptions) -> None:
     if options.format in VIDEO_FORMATS:
         import clients.batch.video_writing  # noqa: F401  (raises if it is not installed)
     if options.half and options.format not in LINEAR_FORMATS:
         raise ValueError("--half: allowed with --format npy or exr")
-    if options.out.exists() and not options.out.is_dir():
-        raise ValueError(f"--out '{options.out}' is a file; allowed: a folder")
 
 
 def _check_several(options: BatchOptions) -> None:
@@ -294,6 +317,20 @@ def _listed(path: Path, states: States, names: Sequence[str]) -> States:
     states = replace(states, listed=read_states(path, names))
     states.check(names)
     return states
+
+
+def profiles_of(options: EyeOptions, texts: Sequence[str]) -> dict[str, dict[str, Any]]:
+    """Return profiles by the names of their folders, with drawn persons if asked for.
+
+    Raises
+    ------
+    ValueError
+        As `read_profiles` and `drawn_people`.
+    """
+    profiles = read_profiles(texts)
+    if options.people is None:
+        return profiles
+    return drawn_people(profiles, options.people, options.first_person)
 
 
 def drawn_people(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import typer
@@ -13,6 +13,7 @@ import typer
 from clients.batch.manifest import Manifest, note_line
 from clients.batch.options import (
     BatchOptions,
+    EyeOptions,
     batch_of,
     workers_and_threads,
 )
@@ -62,20 +63,43 @@ def run(options: BatchOptions, *, quiet: bool) -> dict[str, Any]:
     with only_one(batch.out) as lock:
         check_links(batch)
         pool = _pool(options, batch, n_workers, n_threads, lock)
-        if options.overwrite:
-            begin_anew(batch)
-        with (
-            Manifest(batch.out, batch.described()) as manifest,
-            Progress("batch", quiet=quiet) as progress,
-        ):
-            names = list(batch.job.profiles)
-            task = progress.task(
-                names[0] if len(names) == 1 else f"{len(names)} profiles",
-                total=len(batch.frames) * len(batch.job.profiles),
-            )
-            return run_batch(
-                batch, manifest, pool, on_done=lambda n_done, n_all: task.update(n_done)
-            )
+        return filter_batch(batch, pool, overwrite=options.overwrite, quiet=quiet)
+
+
+def filter_batch(
+    batch: Batch,
+    pool: ProcessPool | RayPool,
+    *,
+    overwrite: bool,
+    quiet: bool,
+    prepare: Callable[[], None] = lambda: None,
+) -> dict[str, Any]:
+    """Filter the missing frames of a batch in a locked folder; return its summary.
+
+    Parameters
+    ----------
+    overwrite : bool
+        Whether to delete the output of another job.
+    quiet : bool
+        Whether to report no progress.
+    prepare : callable
+        Called once the folder is known to belong to the batch.
+    """
+    if overwrite:
+        begin_anew(batch)
+    with (
+        Manifest(batch.out, batch.described()) as manifest,
+        Progress("batch", quiet=quiet) as progress,
+    ):
+        prepare()
+        names = list(batch.job.profiles)
+        task = progress.task(
+            names[0] if len(names) == 1 else f"{len(names)} profiles",
+            total=len(batch.frames) * len(batch.job.profiles),
+        )
+        return run_batch(
+            batch, manifest, pool, on_done=lambda n_done, n_all: task.update(n_done)
+        )
 
 
 def _pool(
@@ -98,7 +122,7 @@ def _pool(
     )
 
 
-def report_lines(summary: dict[str, Any], options: BatchOptions) -> list[str]:
+def report_lines(summary: dict[str, Any], options: EyeOptions) -> list[str]:
     """Format the summary as lines of text."""
     this_run = summary["this_run"]
     n_all, n_failed = summary["frames"], len(summary["failures"])

@@ -13,10 +13,10 @@ import re
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache, cached_property, partial
 from pathlib import Path
 from typing import Any, cast
@@ -85,6 +85,8 @@ class Batch:
         Frames to filter.
     out : Path
         Output folder.
+    details : mapping
+        More that determines the frames, for the manifest.
     """
 
     job: Job
@@ -92,6 +94,7 @@ class Batch:
     source: Path
     frames: Sequence[SourceFrame]
     out: Path
+    details: Mapping[str, Any] = field(default_factory=dict)
 
     def described(self) -> dict[str, Any]:
         """Return the parameters that determine the images, for JSON."""
@@ -109,6 +112,7 @@ class Batch:
                     text_of(path.name): digest
                     for path, (_, digest) in self._videos.items()
                 },
+                **self.details,
             },
             **self.job.described(),
         }
@@ -148,8 +152,13 @@ def _identity(path: Path) -> tuple[int, ...]:
     return status.st_dev, status.st_ino, status.st_size, *times_ns
 
 
-def check_folder(out: Path) -> None:
+def check_folder(out: Path, *, own: Sequence[str] = ()) -> None:
     """Create the output folder, or check that it is empty or belongs to a batch.
+
+    Parameters
+    ----------
+    own : sequence of str
+        Names of files that may be there before a batch.
 
     Raises
     ------
@@ -157,7 +166,7 @@ def check_folder(out: Path) -> None:
         If it contains other files.
     """
     out.mkdir(parents=True, exist_ok=True)
-    others = [path.name for path in out.iterdir() if path.name != LOCK]
+    others = [path.name for path in out.iterdir() if path.name not in (LOCK, *own)]
     # In this order: another batch may be creating its manifest.
     if others and not (out / LINES).exists():
         raise ValueError(

@@ -44,7 +44,7 @@ def with_options(command: Callable[..., None]) -> Callable[..., None]:
     """Give a command an option for each field of its argument, a dataclass.
 
     Annotate fields like parameters of a command.  Commands that share options derive
-    their dataclasses from a common base.
+    their dataclasses from a common base.  Required options are listed first.
     """
     record = get_type_hints(command)["options"]
     hints = get_type_hints(record, include_extras=True)
@@ -57,7 +57,7 @@ def with_options(command: Callable[..., None]) -> Callable[..., None]:
             else field.default,
             annotation=hints[field.name],
         )
-        for field in fields(record)
+        for field in sorted(fields(record), key=lambda one: one.default is not MISSING)
     ]
     return _expanded(command, "options", options, lambda given: record(**given))
 

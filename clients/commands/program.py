@@ -49,6 +49,10 @@ COMMANDS = {
         "clients.batch.program:batch",
         "Filter folders and videos of color and depth, on all cores.",
     ),
+    "stimuli": (
+        "clients.stimuli.program:stimuli",
+        "Draw stimuli of exact angular size, and filter them through eyes.",
+    ),
     "estimate": (
         "clients.commands.eye:estimate",
         "Estimate the eye that reproduces a measured wavefront.",

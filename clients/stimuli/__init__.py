@@ -10,6 +10,9 @@ stimulus   `Stimulus`: light of a picture, its parameters and measured contrast
 coverage   shares of pixels inside shapes
 letters    Sloan letters, Landolt C, tumbling E, reading text
 patterns   gratings, Gabors, edges, noise
+sets       lists of stimuli from the options of the command line
+options    options of `ocufilter stimuli`
+program    the command: stimuli, and how they look through eyes
 """
 
 import lazy_loader

@@ -18,7 +18,7 @@ PIXEL_LIMITS_ARCMIN = (0.01, 60.0)
 SCREEN_LIMITS_MM = (1.0, 100_000.0)
 SCREEN_LIMITS_PX = (8, 100_000)
 DISTANCE_LIMITS_M = (0.05, 1000.0)
-WHITE_LIMITS_CD_M2 = (0.01, 100_000.0)
+WHITE_LIMITS_NIT = (0.01, 100_000.0)
 
 SAME_PITCH_RATIO = 0.005
 """Tolerance between a given pixel and that of a screen at its distance."""
@@ -46,8 +46,8 @@ class Display:
         Size of the picture, 8 to 4096 px.
     pixel_arcmin : float
         Visual angle of a square pixel in the middle, arcmin.
-    white_cd_m2 : float, optional
-        Luminance of white.  With it, parameters of stimuli contain luminances.
+    white_nit : float, optional
+        Luminance of white, cd/m².  With it, stimuli state their luminances.
 
     Raises
     ------
@@ -58,7 +58,7 @@ class Display:
     width_px: int
     height_px: int
     pixel_arcmin: float
-    white_cd_m2: float | None = None
+    white_nit: float | None = None
 
     def __post_init__(self) -> None:
         """Check the values."""
@@ -68,8 +68,8 @@ class Display:
                 raise ValueError(f"{name} is {side_px!r}; allowed: an integer")
             check(name, side_px, SIDE_LIMITS_PX, "px")
         check("pixel_arcmin", self.pixel_arcmin, PIXEL_LIMITS_ARCMIN, "arcmin")
-        if self.white_cd_m2 is not None:
-            check("white_cd_m2", self.white_cd_m2, WHITE_LIMITS_CD_M2, "cd/m2")
+        if self.white_nit is not None:
+            check("white_nit", self.white_nit, WHITE_LIMITS_NIT, "nit")
 
     @classmethod
     def of_screen(
@@ -81,7 +81,7 @@ class Display:
         screen_width_px: int,
         distance_m: float,
         pixel_arcmin: float | None = None,
-        white_cd_m2: float | None = None,
+        white_nit: float | None = None,
     ) -> Display:
         """Return a picture on a screen of known width and distance.
 
@@ -97,8 +97,8 @@ class Display:
             Distance from the eye to the screen.
         pixel_arcmin : float, optional
             Expected visual angle of a pixel, to be checked.
-        white_cd_m2 : float, optional
-            Luminance of white.
+        white_nit : float, optional
+            Luminance of white, cd/m².
 
         Raises
         ------
@@ -129,7 +129,7 @@ class Display:
             width_px=width_px,
             height_px=height_px,
             pixel_arcmin=found_arcmin,
-            white_cd_m2=white_cd_m2,
+            white_nit=white_nit,
         )
 
     @property
@@ -168,5 +168,5 @@ class Display:
             "width_px": self.width_px,
             "height_px": self.height_px,
             "pixel_arcmin": self.pixel_arcmin,
-            "white_cd_m2": self.white_cd_m2,
+            "white_nit": self.white_nit,
         }

@@ -72,8 +72,8 @@ class Stimulus:
             "michelson_contrast": (high - low) / total if total > 0.0 else 0.0,
             "notes": list(self.notes),
         }
-        if (white := self.display.white_cd_m2) is not None:
-            found["luminance_cd_m2"] = {k: white * v for k, v in measured.items()}
+        if (white := self.display.white_nit) is not None:
+            found["luminance_nit"] = {k: white * v for k, v in measured.items()}
         return found
 
 

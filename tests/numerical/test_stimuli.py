@@ -298,13 +298,13 @@ def test_the_light_of_letters_has_their_weber_contrast(
     found = stimuli.tumbling_e(
         0.0,
         height_arcmin=25.0,
-        display=display(white_cd_m2=200.0),
+        display=display(white_nit=200.0),
         contrast=contrast,
         background_light=background_light,
     )
     assert found.light[0, 0] == pytest.approx(background_light)
     assert found.light[68, 80] == pytest.approx(letter_light)
-    luminance = found.described()["luminance_cd_m2"]
+    luminance = found.described()["luminance_nit"]
     ends = sorted([200.0 * letter_light, 200.0 * background_light])
     assert [luminance["least"], luminance["most"]] == pytest.approx(ends)
 
