@@ -190,7 +190,7 @@ def term_names(order: str, count: int) -> list[str]:
 
 def _is_used(values: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Return which (n,) of coefficients (..., n) are not all zero."""
-    return values.reshape(-1, values.shape[-1]).any(axis=0)
+    return (values != 0.0).any(axis=tuple(range(values.ndim - 1)))
 
 
 def _in_frame(zernike_um: ArrayLike, frame: str) -> NDArray[np.float64]:
@@ -234,8 +234,8 @@ def _listed(values: ArrayLike | Mapping[Any, float], order: str) -> NDArray[np.f
         values = [found.get(index, 0.0) for index in range(max(found, default=0) + 1)]
     elif order == "nm":
         raise ValueError(
-            "order 'nm' requires coefficients by term, as {'3,-1': 0.25}; for a list, "
-            f"state one of: {', '.join(FIRST_INDEX)}"
+            "order 'nm' requires coefficients by term, as {'3,-1': 0.25}; allowed: for "
+            f"a list, the order {', '.join(FIRST_INDEX)}"
         )
     given = np.asarray(values, dtype=np.float64)
     if given.ndim == 0 or not 0 < given.shape[-1] <= MAX_VALUES:
