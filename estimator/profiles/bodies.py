@@ -21,7 +21,7 @@ from msgspec import UNSET, Meta, UnsetType
 from estimator.corrections.worn_lens import TYPICAL_DEPTH_MM
 from estimator.eye.parameters import PARAMETERS, Parameter
 from estimator.media import BROWN
-from estimator.optics.zernike import DEFAULT_ORDER, HIGHEST_ORDER
+from estimator.profiles.coefficients import CoefficientsUm, OrderedZernikeBody
 from estimator.profiles.validation import ALLOWED
 
 MAX_ZONES = 12
@@ -295,17 +295,11 @@ PUBLISHED_NAMES = tuple(sorted(path.stem for path in PUBLISHED.glob("*.json")))
 """Names of the schematic eyes of `published`."""
 
 MAX_MEASUREMENTS = 100
-MAX_COEFFICIENT_UM = 200.0
 MAX_FILE_NOTES, MAX_NOTE_CHARACTERS = 10, 400
 
 MEASUREMENTS_ALLOWED = (
     f"a list of 1 to {MAX_MEASUREMENTS} measurements, one at h = v = 0"
 )
-
-
-def coefficients_allowed(order: int) -> str:
-    """Return the allowed coefficients up to a radial order, as text for errors."""
-    return f"an object of 'n,m': um with n from 0 to {order}"
 
 
 FieldAngleDeg = Annotated[float, Meta(ge=-50.0, le=50.0)]
@@ -317,22 +311,16 @@ Frame = Annotated[
 ]
 
 
-def _coefficients_meta(order: int) -> Meta:
-    return Meta(
-        description=f'`"n,m"`: µm, n from 0 to {order}, each term at most once; other '
-        "terms are 0, also if they are given",
-        extra={ALLOWED: coefficients_allowed(order)},
-    )
-
-
-_CoefficientUm = Annotated[float, Meta(ge=-MAX_COEFFICIENT_UM, le=MAX_COEFFICIENT_UM)]
-CoefficientsUm = Annotated[dict[str, _CoefficientUm], _coefficients_meta(HIGHEST_ORDER)]
-CorneaCoefficientsUm = Annotated[
-    dict[str, _CoefficientUm], _coefficients_meta(DEFAULT_ORDER)
-]
 WavelengthNm = Annotated[float, Meta(ge=365.0, le=1014.0)]
 PupilDiameterMm = Annotated[
     float, Meta(ge=1.0, le=9.0, description="diameter of the circle of the terms")
+]
+OrderedZernike = Annotated[
+    OrderedZernikeBody,
+    Meta(description="coefficients in a stated order, instead of `zernike_um`"),
+]
+PupilRadiusMm = Annotated[
+    float, Meta(ge=0.5, le=4.5, description="radius of the circle of the terms")
 ]
 
 
@@ -496,22 +484,26 @@ class PrescriptionBody(
 class ZernikeBody(WavefrontBody, kw_only=True, tag_field="kind", tag="zernike"):
     """A measured wavefront on the axis."""
 
-    zernike_um: CoefficientsUm
-    pupil_diameter_mm: PupilDiameterMm
+    zernike_um: CoefficientsUm | UnsetType = UNSET
+    pupil_diameter_mm: PupilDiameterMm | UnsetType = UNSET
     wavelength_nm: WavelengthNm
     frame: Frame = "eye"
+    zernike: OrderedZernike | UnsetType = UNSET
+    pupil_radius_mm: PupilRadiusMm | UnsetType = UNSET
 
 
 class MeasurementBody(Body, kw_only=True):
     """One wavefront of a set."""
 
-    zernike_um: CoefficientsUm
-    pupil_diameter_mm: PupilDiameterMm
+    zernike_um: CoefficientsUm | UnsetType = UNSET
+    pupil_diameter_mm: PupilDiameterMm | UnsetType = UNSET
     wavelength_nm: WavelengthNm
     kind: Literal["zernike"] = "zernike"
     frame: Frame | UnsetType = UNSET
     h_deg: FieldAngleDeg = 0.0
     v_deg: FieldAngleDeg = 0.0
+    zernike: OrderedZernike | UnsetType = UNSET
+    pupil_radius_mm: PupilRadiusMm | UnsetType = UNSET
 
 
 class ZernikeSetBody(WavefrontBody, kw_only=True, tag_field="kind", tag="zernike_set"):

@@ -1,14 +1,12 @@
 """Fields that several kinds of profiles share, and the correction, from their types."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from fractions import Fraction
 from typing import TYPE_CHECKING, Any
 
 import msgspec
-import numpy as np
 from msgspec import UNSET
-from numpy.typing import NDArray
 
 from estimator.bounded_files import printable
 from estimator.corrections.progressive import ProgressiveLens
@@ -30,12 +28,6 @@ from estimator.media import CATARACTS, DEFAULT_AGE_YEARS, Straylight
 from estimator.note import Note, note_of
 from estimator.optics import prescription as rx
 from estimator.optics.vergence import TYPICAL_ENTRANCE_PUPIL_MM
-from estimator.optics.zernike import (
-    DEFAULT_ORDER,
-    HIGHEST_ORDER,
-    flip_horizontal,
-    index_from_nm,
-)
 from estimator.profiles import bodies
 from estimator.profiles.bodies import (
     CORNEA_SPHERICAL_ABERRATION_UM,
@@ -460,70 +452,3 @@ def _straylight(
         pigment_ratio=body.pigmentation,
         log_s=log_s,
     )
-
-
-def coefficients_um(
-    entries: Mapping[str, float],
-    frame: str,
-    *,
-    path: str,
-    name: str = "zernike_um",
-    highest_order: int = HIGHEST_ORDER,
-) -> NDArray[np.float64]:
-    """Return coefficients (n_terms,), um, in the eye frame.
-
-    They are 28, or more for higher orders that are not zero.
-
-    Parameters
-    ----------
-    entries : mapping
-        Values by ``"n,m"``.
-    frame : {"eye", "examiner"}
-    path, name : str
-        Path of the object that holds them, and their field, for errors.
-    highest_order : int
-        Highest radial order that may be other than zero.
-
-    Raises
-    ------
-    ProfileError
-        A key is not a term, or two keys name the same one.
-    """
-    named: dict[int, tuple[str, float]] = {}
-    order = DEFAULT_ORDER
-    for key, value_um in entries.items():
-        field = f"{path}{name}.{key}"
-        n, j = _term_index(key, field, value_um, highest_order)
-        if j in named:
-            raise ProfileError(
-                field, f"names the same term as {named[j][0]!r}", "each term once"
-            )
-        named[j] = key, value_um
-        order = max(order, n if value_um else 0)
-    zernike_um = np.zeros((order + 1) * (order + 2) // 2)
-    for j, (_, value_um) in named.items():
-        if j < zernike_um.size:
-            zernike_um[j] = value_um
-    return flip_horizontal(zernike_um) if frame == "examiner" else zernike_um
-
-
-def _term_index(
-    key: str, name: str, value_um: float, highest_order: int
-) -> tuple[int, int]:
-    """Return the radial order and the index of a term."""
-    allowed = bodies.coefficients_allowed(highest_order)
-    try:
-        n, m = (int(part) for part in key.split(","))
-    except ValueError:
-        raise ProfileError(name, "is not of the form 'n,m'", allowed) from None
-    try:
-        j = index_from_nm(n, m)
-    except ValueError as error:
-        raise ProfileError(name, str(error), allowed) from None
-    if n > highest_order and value_um != 0.0:
-        raise ProfileError(
-            name,
-            f"radial order {n}, {value_um:g} um",
-            f"{allowed}; higher orders are 0",
-        )
-    return n, j

@@ -24,7 +24,6 @@ from estimator.profiles.bodies import (
     PUBLISHED_NAMES,
     Body,
     CommonBody,
-    CorneaCoefficientsUm,
     EyeBody,
     Frame,
     PrescriptionBody,
@@ -33,6 +32,7 @@ from estimator.profiles.bodies import (
     ZernikeBody,
     ZernikeSetBody,
 )
+from estimator.profiles.coefficients import CorneaCoefficientsUm
 from estimator.profiles.validation import ALLOWED
 
 NUMBER_LIMIT = 1e9

@@ -36,7 +36,8 @@ from estimator.optics.units import MM_PER_M, REFERENCE_WAVELENGTH_NM
 from estimator.optics.zernike import DEFAULT_ORDER, N_TERMS, norms
 from estimator.profiles import bodies, given_bodies
 from estimator.profiles.bodies import IntraocularBody
-from estimator.profiles.common_fields import coefficients_um, common_fields
+from estimator.profiles.coefficients import coefficients_um
+from estimator.profiles.common_fields import common_fields
 from estimator.profiles.eye_profile import SURFACES_PUPIL_MM, EyeProfile
 from estimator.profiles.given_bodies import ImplantBody, PseudophakicBody
 from estimator.profiles.surfaces import published_eye, radii_mm, surface_model

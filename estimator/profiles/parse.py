@@ -25,11 +25,8 @@ from estimator.optics.vergence import (
 )
 from estimator.optics.zernike import remove_central_tilt, rescale_pupil, summed_terms
 from estimator.profiles import bodies
-from estimator.profiles.common_fields import (
-    coefficients_um,
-    common_fields,
-    prescription,
-)
+from estimator.profiles.coefficients import measured_um, order_notes
+from estimator.profiles.common_fields import common_fields, prescription
 from estimator.profiles.eye_profile import EYE_PUPIL_MM, EyeProfile, Measurement
 from estimator.profiles.validation import KIND, convert
 from estimator.wavefront.field_wavefronts import polynomial_in_mm, rays_cross
@@ -243,37 +240,33 @@ def _primary(first: Measurement, *others: Measurement) -> dict[str, Any]:
 
 
 def _zernike(body: bodies.ZernikeBody) -> EyeProfile:
-    measurement = Measurement(
-        coefficients_um(body.zernike_um, body.frame, path=""),
-        body.pupil_diameter_mm,
-        body.wavelength_nm,
-    )
+    zernike_um, pupil_mm = measured_um(body, body.frame, path="")
+    common = common_fields(body, "zernike")
+    common["notes"] += order_notes(body, body.frame, zernike_um, pupil_mm)
     return EyeProfile(
         kind="zernike",
-        **_primary(measurement),
-        max_pupil_diameter_mm=measurement.pupil_diameter_mm,
-        **common_fields(body, "zernike"),
+        **_primary(Measurement(zernike_um, pupil_mm, body.wavelength_nm)),
+        max_pupil_diameter_mm=pupil_mm,
+        **common,
     )
 
 
 def _zernike_set(body: bodies.ZernikeSetBody) -> EyeProfile:
     """Return the profile of a set; its widest on-axis measurement leads."""
-    frame = "eye" if body.frame is msgspec.UNSET else body.frame
-    measurements = [
-        Measurement(
-            coefficients_um(
-                entry.zernike_um,
-                frame if entry.frame is msgspec.UNSET else entry.frame,
-                path=f"measurements.{number}.",
-            ),
-            entry.pupil_diameter_mm,
-            entry.wavelength_nm,
-            entry.h_deg,
-            entry.v_deg,
+    measurements: list[Measurement] = []
+    notes: tuple[Note, ...] = ()
+    for number, entry in enumerate(body.measurements):
+        frame = body.frame if entry.frame is msgspec.UNSET else entry.frame
+        side = "eye" if frame is msgspec.UNSET else frame
+        zernike_um, pupil_mm = measured_um(entry, side, path=f"measurements.{number}.")
+        measurements.append(
+            Measurement(
+                zernike_um, pupil_mm, entry.wavelength_nm, entry.h_deg, entry.v_deg
+            )
         )
-        for number, entry in enumerate(body.measurements)
-    ]
-    measurements, notes = merged_repeats(measurements)
+        if measurements[-1].is_on_axis:  # a set has many others
+            notes += order_notes(entry, side, zernike_um, pupil_mm)
+    measurements, repeats = merged_repeats(measurements)
     on_axis = [m for m in measurements if m.is_on_axis]
     if not on_axis:
         raise ProfileError(
@@ -282,7 +275,7 @@ def _zernike_set(body: bodies.ZernikeSetBody) -> EyeProfile:
     first = max(on_axis, key=lambda m: m.pupil_diameter_mm)
     others = [m for m in measurements if m is not first]
     common = common_fields(body, "zernike set")
-    common["notes"] = (*common["notes"], *notes)
+    common["notes"] = (*common["notes"], *notes, *repeats)
     return EyeProfile(
         kind="zernike_set",
         **_primary(first, *others),

@@ -11,6 +11,7 @@ from msgspec import inspect
 
 from estimator.profiles import (
     bodies,
+    coefficients,
     given_bodies,
 )
 from estimator.profiles.validation import ALLOWED, KIND, allowed_values
@@ -25,6 +26,7 @@ INTRODUCTIONS: dict[type[msgspec.Struct], str] = {
     bodies.ZernikeBody: "Kind `zernike`: one measured wavefront on the axis.",
     bodies.ZernikeSetBody: "Kind `zernike_set`: wavefronts of one eye.",
     bodies.MeasurementBody: "Each entry of `measurements`.",
+    coefficients.OrderedZernikeBody: "`zernike` of a measurement.",
     bodies.RetinaBody: "`retina`.",
     bodies.StraylightBody: "`straylight`; an empty object uses the defaults.",
     bodies.PowersBody: "`correction`: fields of every kind.",
@@ -63,6 +65,7 @@ def profile_schema() -> dict[str, Any]:
     )
     for part in parts.values():
         _separate_design(part)
+        _require_either(part)
     (root,) = schema
     return {
         "$schema": SCHEMA_DRAFT,
@@ -70,6 +73,17 @@ def profile_schema() -> dict[str, Any]:
         "oneOf": root["anyOf"],
         "$defs": {name: _without_discriminators(parts[name]) for name in sorted(parts)},
     }
+
+
+def _require_either(part: dict[str, Any]) -> None:
+    """Require exactly one of two fields of a measurement."""
+    pairs = [
+        {"oneOf": [{"required": [name]}, {"required": [other]}]}
+        for name, (other, _) in coefficients.EITHER.items()
+        if {name, other} <= set(part.get("properties", {}))
+    ]
+    if pairs:
+        part["allOf"] = pairs
 
 
 def _separate_design(part: dict[str, Any]) -> None:
@@ -171,6 +185,8 @@ def _row(field: inspect.Field) -> str:
 def _default(field: inspect.Field) -> str:
     if field.required:
         return "required"
+    if field.encode_name in coefficients.EITHER:
+        return f"required, or `{coefficients.EITHER[field.encode_name][0]}`"
     value = field.default
     match value:
         case msgspec.NODEFAULT | msgspec.UNSET | None:

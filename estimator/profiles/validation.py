@@ -26,6 +26,9 @@ DEFAULT_DESIGNS = {"iol": "monofocal"}
 ALLOWED = "allowed"
 """Key of `msgspec.Meta.extra`: the allowed values in words, for error messages."""
 
+ALLOWED_FOR_LIST = "allowed_for_list"
+"""Key of the same for a list where none is allowed; it may be absent."""
+
 MAX_SHOWN = 160
 """Largest number of characters of a value in a message."""
 
@@ -90,6 +93,8 @@ def _check(value: object, kind: inspect.Type, path: str) -> None:
         case inspect.Metadata():
             allowed = (kind.extra or {}).get(ALLOWED)
             if allowed is not None and not _accepts(value, kind.type):
+                if isinstance(value, list):
+                    allowed = (kind.extra or {}).get(ALLOWED_FOR_LIST, allowed)
                 raise ProfileError(path, _mismatch(value, kind.type), allowed)
             _check(value, kind.type, path)
         case inspect.UnionType():

@@ -117,8 +117,10 @@ def test_broken_abp_names_the_line_or_field(tmp_path, text, where):
 def test_csv_takes_its_pupil_from_beside_it_or_from_comments(tmp_path):
     path = tmp_path / "eye.csv"
     path.write_text("n,m,um\n2,0,1.5\n3,-1,-0.25\n")
-    with pytest.raises(ProfileError, match="pupil_diameter_mm"):
+    with pytest.raises(ProfileError, match="wavelength_nm"):
         load_profile(path)
+    with pytest.raises(ProfileError, match="pupil_diameter_mm"):
+        load_profile(path, wavelength_nm=550.0)
     beside = load_profile(path, pupil_diameter_mm=6.0, wavelength_nm=550.0)
     path.write_text(
         "# pupil_diameter_mm: 6\n# wavelength_nm = 550\n2,0,1.5\n3,-1,-0.25"

@@ -164,7 +164,8 @@ def test_the_schema_has_the_fields_that_the_page_shows(name):
 
 def test_every_kind_of_profile_is_shown_and_can_be_read():
     found = shown()
-    assert [body["kind"] for body in found] == sorted(KINDS, key=IN_ORDER.index)
+    kinds = dict.fromkeys(body["kind"] for body in found)
+    assert list(kinds) == sorted(KINDS, key=IN_ORDER.index)
     for body in found:
         assert parse_profile(body).kind in KINDS
 
@@ -206,6 +207,8 @@ def test_the_tables_list_every_field_of_a_profile():
 )
 def test_the_limits_of_a_number_are_those_that_are_kept(body, kind, name):
     low, high = reference.field_limits(kind, name)
+    if name == "pupil_radius_mm":
+        del (body := {**body})["pupil_diameter_mm"]
     for inside in (low, high):
         parse_profile({**body, name: inside})
     for outside in (low - 0.01, high + 0.01):
