@@ -11,6 +11,8 @@ surfaces             from typed surfaces to an eye; schematic eyes of the litera
 reference            JSON Schema, tables and limits of the typed profiles
 files                .json, .abp, .csv and .zmx profiles, and eyes by name
 coefficient_files    tables of coefficients in .abp and .csv files
+coefficient_table    the settings and coefficients that their lines state
+coefficients         coefficients of a profile, in any order, as arrays in um
 lens_files           eyes of lens files, and those in JSON files of optiland
 zemax_files          eyes in .zmx files
 presets.json         the six presets
