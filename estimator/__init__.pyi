@@ -38,6 +38,9 @@ from .optics.vergence import chromatic_refraction_dpt as chromatic_refraction_dp
 from .optics.zernike import nm_from_index as nm_from_index
 from .optics.zernike import rescale_pupil as rescale_pupil
 from .optics.zernike import zernike_values as zernike_values
+from .optics.zernike_orders import zernike_from as zernike_from
+from .optics.zernike_orders import zernike_to as zernike_to
+from .optics.zernike_words import describe_zernike as describe_zernike
 from .profiles.files import MAX_PROFILE_BYTES as MAX_PROFILE_BYTES
 from .profiles.files import PROFILE_SUFFIXES as PROFILE_SUFFIXES
 from .profiles.files import load_profile as load_profile

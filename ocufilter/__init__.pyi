@@ -34,6 +34,7 @@ from estimator import best_correction_um as best_correction_um
 from estimator import chromatic_refraction_dpt as chromatic_refraction_dpt
 from estimator import compute_psf_batch as compute_psf_batch
 from estimator import compute_psfs as compute_psfs
+from estimator import describe_zernike as describe_zernike
 from estimator import draw_section as draw_section
 from estimator import drawn_biometry as drawn_biometry
 from estimator import drawn_fields as drawn_fields
@@ -64,6 +65,8 @@ from estimator import rescale_pupil as rescale_pupil
 from estimator import thread_count as thread_count
 from estimator import wavefront_aberrations as wavefront_aberrations
 from estimator import white_light_transfer as white_light_transfer
+from estimator import zernike_from as zernike_from
+from estimator import zernike_to as zernike_to
 from estimator import zernike_values as zernike_values
 from filter_service import Accumulation as Accumulation
 from filter_service import BadMessage as BadMessage

@@ -8,6 +8,11 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+from clients.commands.coefficients import (
+    comparison_text,
+    measured_facts,
+    measurement_at,
+)
 from clients.commands.optics import (
     FOCUS_LIMITS_DPT,
     PUPIL_LIMITS_MM,
@@ -105,6 +110,7 @@ def _summary(found: "EstimatedEye") -> dict[str, Any]:
         "residual_um": found.residual_um.tolist(),
         "zernike_radius_mm": found.zernike_radius_mm,
         "wavelength_nm": found.wavelength_nm,
+        **measured_facts(measurement_at(profile, h_deg=0.0, v_deg=0.0)),
         "mean_abs_error_um": found.mean_abs_error_um,
         "measurement_count": max(len(profile.measurements), 1),
         "time_ms": found.time_ms,
@@ -127,6 +133,8 @@ def _report(summary: dict[str, Any], plot: Path | None) -> None:
         known = "" if ratio is None else f"{100.0 * ratio:5.0f} %"
         bound = "  at its bound" if name in summary["on_bound"] else ""
         print_line(f"{name:<38}{value:>11.5g}  {known}{bound}")
+    if "measured" in summary:
+        print_line(comparison_text(summary["measured"], summary["zernike_um"]))
     print_line(
         f"{summary['profile']}, {summary['method']}: mean error "
         f"{summary['mean_abs_error_um']:.2g} um over 25 terms, "

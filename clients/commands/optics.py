@@ -7,6 +7,21 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+from clients.commands.coefficients import (
+    USUAL,
+    Csv,
+    Describe,
+    Frame,
+    Normalization,
+    Order,
+    Unit,
+    converted_facts,
+    measured_facts,
+    measurement_at,
+    print_csv,
+    print_table,
+    words,
+)
 from filter_service.command_line import (
     CommandFailed,
     Json,
@@ -90,11 +105,18 @@ def wavefront(
             "wavefront (slope)."
         ),
     ] = "opd",
+    order: Order = "osa",
+    unit: Unit = "um",
+    normalization: Normalization = None,
+    frame: Frame = "eye",
+    describe: Describe = False,
+    csv: Csv = False,
     json_output: Json = False,
 ) -> None:
     """Print the Zernike coefficients of an eye's wavefront in one direction.
 
-    Coefficients are OSA, um, at the cornea.  For a measurement, prescription or preset,
+    Coefficients are at the cornea.  Those of a measurement in this direction are beside
+    them, on the circle of that measurement.  For a measurement, prescription or preset,
     they describe the wavefront that frames and the commands `field` and `psf` use,
     through the correction, on the circle of the entrance pupil.  On the axis, this is
     the measured wavefront.  Off the axis, it is the most probable wavefront of people
@@ -105,6 +127,8 @@ def wavefront(
     ocufilter wavefront eye.json --stop-mm 4 --wavelength-nm 555 --h-deg 20
     """
     _check(stop_mm, pupil_mm, wavelength_nm, h_deg, v_deg, focus_dpt, object_dpt)
+    if csv and json_output:
+        raise ValueError("--csv, --json: allowed: one of them")
 
     from estimator.profiles.files import load_profile
     from estimator.wavefront.aberrations import wavefront_aberrations
@@ -149,12 +173,21 @@ def wavefront(
         **view,
         "focus_dpt": focus_dpt,
         "pupil_diameter_mm": pupil_mm,
+        **measured_facts(measurement_at(profile, h_deg=h_deg, v_deg=v_deg)),
         "notes": list(notes),
     }
+    converted = converted_facts(
+        summary, order=order, unit=unit, normalization=normalization, frame=frame
+    )
+    if describe:
+        summary["in_words"] = words(summary)
     if json_output:
-        print_json(summary)
+        is_usual = converted["convention"] == USUAL
+        print_json(summary if is_usual else summary | converted)
+    elif csv:
+        print_csv(summary, converted, eye_side=profile.eye_side)
     else:
-        _report(summary)
+        _report(summary, converted)
 
 
 def _of_frames(
@@ -268,16 +301,12 @@ def _facts(found: "Aberrations") -> dict[str, Any]:
     }
 
 
-def _report(summary: dict[str, Any]) -> None:
-    from estimator.optics.zernike import nm_from_index
-
+def _report(summary: dict[str, Any], converted: dict[str, Any]) -> None:
     for note in summary["notes"]:
         print_line(f"note: {note}")
-    print_line("  j  (n, m)        um")
-    for j, value in enumerate(summary["zernike_um"]):
-        n, m = nm_from_index(j)
-        if j > 0:
-            print_line(f"{j:>3}  ({n},{m:>2})  {value:>+12.6f}")
+    print_table(summary, converted)
+    for sentence in summary.get("in_words", []):
+        print_line(sentence)
     ellipse, pupil_mm = summary["pupil_ellipse"], summary["pupil_diameter_mm"]
     given = f"stop diameter {summary['stop_diameter_mm']:g} mm"
     if pupil_mm is not None:

@@ -3,6 +3,8 @@
 arrays            arrays in the form that compiled loops require
 units             unit conversions, reference wavelengths
 zernike           Zernike polynomials: indices, values, gradients, rescaling, mirroring
+zernike_orders    coefficients in the orders, normalizations and units of programs
+zernike_words     coefficients in words
 media             refractive indices by wavelength: ocular media, formulas, tables
 gradients         gradient-index media
 forms             surface forms other than conics, biconics and offset terms

@@ -113,7 +113,7 @@ def zernike_from(
     given = _listed(values, order)
     last = int(np.flatnonzero(_is_used(given)).max(initial=0))
     if last > place.max():
-        n, _, _ = _term(order, last)
+        n, _, _ = term_of(order, last)
         raise ValueError(
             f"{order} term {term_names(order, last + 1)[last]} has radial order {n}: "
             f"must be 0 above order {HIGHEST_ORDER}"
@@ -289,7 +289,7 @@ def _places(
     place = np.full(MAX_TERMS, -1)
     factor = np.ones(MAX_TERMS) if normalization == "rms" else norms(MAX_TERMS).copy()
     for index in range(N_FRINGE - 1 if order == "fringe" else MAX_TERMS):
-        n, m, sign = _term(order, index)
+        n, m, sign = term_of(order, index)
         j = index_from_nm(n, m)
         place[j] = index
         factor[j] *= sign
@@ -298,7 +298,7 @@ def _places(
     return place, factor
 
 
-def _term(order: str, index: int) -> tuple[int, int, int]:
+def term_of(order: str, index: int) -> tuple[int, int, int]:
     """Return n, m and the sign of the OSA/ANSI polynomial at a place in an order."""
     if order == "fringe":
         return (*_fringe_term(index), 1)

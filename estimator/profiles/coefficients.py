@@ -285,14 +285,14 @@ def order_notes(
     unit = given.unit
     if unit == "waves":
         unit += f" of {body.wavelength_nm:g} nm"
-    norm = "RMS 1" if _normalization(given) == "rms" else "1 at the edge"
+    norm = "" if _normalization(given) == "rms" else "not "
     side = "person" if frame == "eye" else "examiner"
     words = describe_zernike(zernike_um, pupil_diameter_mm=pupil_diameter_mm)
     note = Note(
         "zernike_order",
-        f"coefficients by {ORDER_NAMES[given.order]}, polynomials of {norm}, {unit}, "
-        f"positive where light is {given.positive}, x to the {side}'s right, circle of "
-        f"{pupil_diameter_mm:g} mm: {'; '.join(words) or 'all 0'}",
+        f"coefficients by {ORDER_NAMES[given.order]}, {norm}normalized to RMS 1, in "
+        f"{unit}, positive where light is {given.positive}, x to the {side}'s right, "
+        f"on a circle of {pupil_diameter_mm:.4g} mm: {'; '.join(words) or 'all 0'}",
         pupil_diameter_mm=pupil_diameter_mm,
         wavelength_nm=body.wavelength_nm,
     )

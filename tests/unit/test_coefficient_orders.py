@@ -5,7 +5,11 @@ import json
 import numpy as np
 import pytest
 
-from estimator.optics.zernike_orders import FIRST_INDEX, zernike_to
+from estimator.optics.zernike_orders import (
+    DEFAULT_NORMALIZATION,
+    FIRST_INDEX,
+    zernike_to,
+)
 from estimator.profiles.files import load_profile
 from estimator.profiles.parse import ProfileError, parse_profile
 
@@ -45,8 +49,10 @@ def test_a_list_in_each_order_for_both_eyes_and_views(order, frame, eye_side):
     assert note.code == "zernike_order"
     assert note.values == {"pupil_diameter_mm": 6.0, "wavelength_nm": 555.0}
     assert ("x to the examiner's right" in note) == (frame == "examiner")
-    assert "waves of 555 nm" in note
-    assert "circle of 6 mm: +1.000 um Z(2,0): myopia, M -0.77 dpt; " in note
+    assert ", in waves of 555 nm, positive where light is ahead, " in note
+    is_rms = DEFAULT_NORMALIZATION[order] == "rms"
+    assert f", {'' if is_rms else 'not '}normalized to RMS 1, " in note
+    assert "on a circle of 6 mm: +1.000 um Z(2,0): myopia, M -0.77 dpt; " in note
     assert (
         "the tail of the image of a point points up and to the person's right" in note
     )
