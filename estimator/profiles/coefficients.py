@@ -4,7 +4,7 @@
 """
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal, Protocol
 
 import msgspec
 import numpy as np
@@ -31,9 +31,6 @@ from estimator.optics.zernike_orders import (
 )
 from estimator.optics.zernike_words import describe_zernike
 from estimator.profiles.validation import ALLOWED, ALLOWED_FOR_LIST
-
-if TYPE_CHECKING:
-    from estimator.profiles.bodies import MeasurementBody, ZernikeBody
 
 MAX_COEFFICIENT_UM = 200.0
 
@@ -200,14 +197,24 @@ EITHER = {
 """Fields of a measurement, of which one of two is required, with the allowed values."""
 
 
+class CoefficientsOnACircle(Protocol):
+    """Fields of `bodies.ZernikeBody` and `bodies.MeasurementBody`."""
+
+    wavelength_nm: float
+    zernike_um: dict[str, float] | UnsetType
+    zernike: OrderedZernikeBody | UnsetType
+    pupil_diameter_mm: float | UnsetType
+    pupil_radius_mm: float | UnsetType
+
+
 def measured_um(
-    body: "ZernikeBody | MeasurementBody", frame: str, *, path: str
+    body: CoefficientsOnACircle, frame: str, *, path: str
 ) -> tuple[NDArray[np.float64], float]:
     """Return the coefficients of a measurement, and the diameter of their circle.
 
     Parameters
     ----------
-    body : ZernikeBody or MeasurementBody
+    body : CoefficientsOnACircle
     frame : {"eye", "examiner"}
     path : str
         Path of the measurement, for errors.
@@ -273,7 +280,7 @@ def _normalization(given: OrderedZernikeBody) -> str:
 
 
 def order_notes(
-    body: "ZernikeBody | MeasurementBody",
+    body: CoefficientsOnACircle,
     frame: str,
     zernike_um: NDArray[np.float64],
     pupil_diameter_mm: float,
