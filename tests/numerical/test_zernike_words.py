@@ -90,6 +90,19 @@ def test_powers_are_those_of_the_prescription():
     assert words == "-1.000 um Z(2,0): hyperopia, M +1.73 dpt"  # 4 √3 / 2²
 
 
+@pytest.mark.parametrize(("m", "axis_deg"), [(2, 90), (-2, 45)])
+def test_the_cylinder_leaves_the_meridian_of_more_power(m, axis_deg):
+    """The axis is at right angles to it, and mirrored as the examiner sees the eye."""
+    zernike_um = np.zeros(28)
+    zernike_um[index_from_nm(2, m)] = 0.3
+    (words,) = describe_zernike(zernike_um, pupil_diameter_mm=PUPIL_MM)
+    assert words.endswith(f", axis {axis_deg} deg")
+    angles_rad = np.radians(np.arange(0, 180, 5))
+    rim_um = zernike_term(index_from_nm(2, m), np.cos(angles_rad), np.sin(angles_rad))
+    strongest_deg = np.degrees(angles_rad[rim_um.argmax()])
+    assert axis_deg == 180.0 - (strongest_deg + 90.0) % 180.0
+
+
 @pytest.mark.parametrize(("sign", "word"), [(1, "more"), (-1, "less")])
 def test_spherical_aberration_by_the_power_of_zones(sign, word):
     zernike_um = sign * 0.2 * np.eye(28)[index_from_nm(4, 0)]

@@ -1,6 +1,7 @@
 """Profiles and files with coefficients in stated orders, normalizations and units."""
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -8,12 +9,15 @@ import pytest
 from estimator.optics.zernike_orders import (
     DEFAULT_NORMALIZATION,
     FIRST_INDEX,
+    term_of,
     zernike_to,
 )
 from estimator.profiles.files import load_profile
 from estimator.profiles.parse import ProfileError, parse_profile
+from tests.source_tree import ROOT
 
 TERMS_UM = {"2,0": 1.0, "2,2": 0.5, "2,-2": -0.5, "3,1": 0.6, "3,-1": 0.25}
+PAGE = ROOT / "docs" / "how-to" / "measurements.md"
 BODY = {"kind": "zernike", "pupil_diameter_mm": 6.0, "wavelength_nm": 555.0}
 EXPECTED = parse_profile({**BODY, "zernike_um": TERMS_UM})
 SETTINGS = "# pupil_diameter_mm: 6.0\n# wavelength_nm: 555\n"
@@ -162,3 +166,19 @@ def test_an_abp_file_in_waves(tmp_path):
 def test_a_table_whose_order_is_not_clear_is_refused(tmp_path, text, message):
     with pytest.raises(ProfileError, match=message):
         loaded(tmp_path, SETTINGS + text)
+
+
+def test_the_page_lists_the_terms_and_defaults_of_each_order():
+    page = PAGE.read_text(encoding="utf-8")
+    rows = re.findall(
+        r"^\| `([a-z-]+)`[^|]*\| (\d) \| (.*) \| (yes|no) \|$", page, re.M
+    )
+    assert [row[0] for row in rows] == list(FIRST_INDEX)
+    for order, first, terms, is_normalized in rows:
+        assert int(first) == FIRST_INDEX[order]
+        assert (is_normalized == "yes") == (DEFAULT_NORMALIZATION[order] == "rms")
+        shown = re.findall(r"(-?)\((\d),(-?\d)\)", terms)
+        for number, (sign, n, m) in enumerate(shown, start=1):
+            found = term_of(order, number - int(first))
+            assert found == (int(n), int(m), -1 if sign else 1)
+        assert len(shown) == 8
