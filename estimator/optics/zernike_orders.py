@@ -91,7 +91,8 @@ def zernike_from(
         Wavelength of the unit ``"waves"``, which requires it.
     frame : {"eye", "examiner"}, optional
         ``"eye"`` has x to the person's right, ``"examiner"`` to the right of someone
-        who faces the person, as OSA/ANSI and ISO 24157 have for either eye.
+        who faces the person, as OSA/ANSI and ISO 24157 (with the axes of ISO 8429) have
+        it for either eye.
     positive : {"ahead", "behind"}, optional
         Where the wavefront is positive: where light is ahead, as in OSA/ANSI, or where
         it is behind because its optical path is longer.

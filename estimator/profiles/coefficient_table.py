@@ -330,7 +330,8 @@ def _check_convention(shown: str, text: str, where: str) -> None:
 def _text(name: str, value: str) -> str:
     """Return the text of a setting as profiles have it; they validate it."""
     if name == "frame":
-        return value.lower()
+        is_standard = re.search(NAMES["order"]["osa"], value.lower())
+        return "examiner" if is_standard else value.lower()
     return SIDES.get(value.lower(), value) if name == "eye_side" else value
 
 

@@ -48,6 +48,8 @@ def assert_same_eye(found, **changes):
         "# frame: examiner\n# eye_side: OS\n",
         "# FRAME = Examiner\n# Eye_Side: os\n",
         "# frame examiner\n# Eye: left\n",
+        "# frame: ISO 24157\n# Eye side: left\n",
+        "# Frame: ANSI Z80.28\n# eye side = Left\n",
         "#frame,examiner,\n#eye_side;OS;\n",
         "# Frame: examiner\n# left eye\n# eye: L\n",
     ],
