@@ -112,7 +112,9 @@ class StreamOptions:
     ] = 63.0
     profile: Annotated[
         str,
-        typer.Option(help="Preset name, JSON, or a .json, .abp, .csv or .zmx file."),
+        typer.Option(
+            help="Preset name, JSON, or a .json, .abp, .csv, .zmx or .txt file."
+        ),
     ] = "myopia"
     right_profile: Annotated[
         str | None,

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
+from tests.exports import irx3_export, vision_prescription
 from tests.source_tree import ROOT
 
 FOLDERS = (
@@ -218,6 +219,9 @@ def make_files(folder: Path) -> None:
         body = {"kind": "prescription", "sphere_dpt": sphere_dpt}
         (folder / f"{name}.json").write_text(json.dumps(body))
     terms = "Z[2, 0] = 3.2\nZ[3, -1] = 0.25\n"
+    (folder / "prescription.json").write_text(json.dumps(vision_prescription()))
+    export = irx3_export(**{"Wavelength (nm)": "780"})
+    (folder / "irx3_export.txt").write_text(export, encoding="utf-8")
     (folder / "eye.abp").write_text(f"Ap = 6.0\nWa = 555\n{terms}")
     eye = json.loads(FROZEN_FILES.read_text("utf-8"))["files"]["even asphere, centered"]
     (folder / "eye.zmx").write_text(eye["zmx"], encoding="utf-8")

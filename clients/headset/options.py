@@ -27,8 +27,8 @@ class EyeOptions:
     profile: Annotated[
         str,
         typer.Option(
-            help="Profile of both eyes: preset name, JSON, or a .json, .abp, .csv or "
-            ".zmx file."
+            help="Profile of both eyes: preset name, JSON, or a .json, .abp, .csv, "
+            ".zmx or .txt file."
         ),
     ] = "myopia"
     left: Annotated[

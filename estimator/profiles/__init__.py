@@ -9,12 +9,14 @@ parse                from a typed profile to an `EyeProfile`
 given_eyes           from a typed profile to an eye given by its surfaces
 surfaces             from typed surfaces to an eye; schematic eyes of the literature
 reference            JSON Schema, tables and limits of the typed profiles
-files                .json, .abp, .csv and .zmx profiles, and eyes by name
+files                .json, .abp, .csv, .zmx and .txt profiles, and eyes by name
 coefficient_files    tables of coefficients in .abp and .csv files
 coefficient_table    the settings and coefficients that their lines state
 coefficients         coefficients of a profile, in any order, as arrays in um
 lens_files           eyes of lens files, and those in JSON files of optiland
 zemax_files          eyes in .zmx files
+fhir_files           prescriptions in JSON files of FHIR
+irx3_files           measurements in .txt files of the aberrometer irx3
 presets.json         the six presets
 published/           schematic eyes with their sources
 measured_wavefront   a measurement used in closed form, without an eye model

@@ -357,7 +357,12 @@ class FileNoteBody(Body, kw_only=True):
     """A note of the reader of a file."""
 
     code: Literal[
-        "file_axis", "file_comments", "file_configurations", "file_dispersion"
+        "file_axis",
+        "file_comments",
+        "file_configurations",
+        "file_dispersion",
+        "file_measurement",
+        "file_prescription",
     ]
     text: Annotated[str, Meta(max_length=MAX_NOTE_CHARACTERS)]
     values: Annotated[

@@ -1,4 +1,4 @@
-"""Profile files: JSON, ``.abp`` of the paper's framework, CSV, and lens files."""
+"""Profile files: JSON, tables of coefficients, lens files, exports of instruments."""
 
 import codecs
 from collections.abc import Callable
@@ -9,6 +9,11 @@ from estimator.bounded_files import InvalidFile, loads_bounded, read_bytes, reas
 from estimator.eye.checked_fields import did_you_mean
 from estimator.profiles.bodies import PUBLISHED_NAMES
 from estimator.profiles.coefficient_files import abp_body, csv_body
+from estimator.profiles.fhir_files import (
+    is_vision_prescription,
+    vision_prescription_body,
+)
+from estimator.profiles.irx3_files import WAVELENGTH, irx3_body
 from estimator.profiles.lens_files import is_optiland, optiland_body
 from estimator.profiles.parse import (
     EyeProfile,
@@ -18,7 +23,7 @@ from estimator.profiles.parse import (
 )
 from estimator.profiles.zemax_files import zmx_body
 
-PROFILE_SUFFIXES = (".json", ".abp", ".csv", ".zmx")
+PROFILE_SUFFIXES = (".json", ".abp", ".csv", ".zmx", ".txt")
 MAX_PROFILE_BYTES = 2_000_000
 """Size limit of a profile file: 66 coefficients at 400 field directions take 0.7 MB of
 JSON."""
@@ -33,7 +38,7 @@ SAVE_AS = {
     **dict.fromkeys((".zos", ".zar"), "save the lens as .zmx in OpticStudio"),
     **dict.fromkeys((".seq", ".len", ".roa"), "save the lens as .zmx or with optiland"),
     **dict.fromkeys((".xlsx", ".xls", ".ods"), "save the sheet of one eye as .csv"),
-    **dict.fromkeys((".txt", ".dat", ".tsv"), "rename a table of n,m,um to .csv"),
+    **dict.fromkeys((".dat", ".tsv"), "rename a table of n,m,um to .csv"),
 }
 """What to do with files of other kinds."""
 
@@ -72,11 +77,11 @@ def load_profile(
     ----------
     source : str or Path
         Name of a preset (see `preset_names`) or of a schematic eye
-        (`bodies.PUBLISHED_NAMES`), a ``.json``, ``.abp``, ``.csv`` or ``.zmx`` file,
-        or a JSON object, ``{"kind": "prescription", "sphere_dpt": -2}``.
+        (`bodies.PUBLISHED_NAMES`), a ``.json``, ``.abp``, ``.csv``, ``.zmx`` or
+        ``.txt`` file, or a JSON object, ``{"kind": "prescription", "sphere_dpt": -2}``.
     pupil_diameter_mm, wavelength_nm : float, optional
         Pupil and wavelength of a CSV file, which may instead contain them as
-        ``# pupil_diameter_mm: 5`` lines.
+        ``# pupil_diameter_mm: 5`` lines, and wavelength of a ``.txt`` file.
 
     Raises
     ------
@@ -130,8 +135,8 @@ def profile_body(
     reader = READERS.get(path.suffix.lower())
     allowed = (
         f"a preset ({', '.join(preset_names())}), a schematic eye "
-        f"({', '.join(PUBLISHED_NAMES)}), a .json, .abp, .csv or .zmx "
-        "file, or a JSON object"
+        f"({', '.join(PUBLISHED_NAMES)}), a .json, .abp, .csv, .zmx or "
+        ".txt file, or a JSON object"
     )
     if reader is None:
         if hint := SAVE_AS.get(path.suffix.lower()):
@@ -156,6 +161,12 @@ def profile_body(
     if reader is csv_body:
         given = {"pupil_diameter_mm": pupil_diameter_mm, "wavelength_nm": wavelength_nm}
         body.update({k: v for k, v in given.items() if v is not None})
+    if reader is irx3_body:
+        if wavelength_nm is not None:
+            body["wavelength_nm"] = wavelength_nm
+        if "wavelength_nm" not in body:
+            allowed = f"a line '{WAVELENGTH}', a tab and the instrument's wavelength"
+            raise InvalidProfileFile(path, "wavelength_nm", "is missing", allowed)
     return body
 
 
@@ -204,12 +215,18 @@ def _json_body(text: str, name: str) -> dict[str, Any]:
         raise ProfileError("", f"{body!r:.60} is not an object", "one JSON object")
     if is_optiland(body):
         return optiland_body(body, name)
+    if is_vision_prescription(body):
+        return vision_prescription_body(body, name)
     if "surfaces" in body:  # files of schematic eyes need not state their kind
         body.setdefault("kind", "surfaces")
     return body
 
 
 READERS: dict[str, Callable[[str, str], dict[str, Any]]] = dict(
-    zip(PROFILE_SUFFIXES, (_json_body, abp_body, csv_body, zmx_body), strict=True)
+    zip(
+        PROFILE_SUFFIXES,
+        (_json_body, abp_body, csv_body, zmx_body, irx3_body),
+        strict=True,
+    )
 )
 """Functions of the text of a file, and the name of an eye without a name in it."""

@@ -17,6 +17,7 @@ from PIL import Image
 from estimator import InvalidFile, ProfileError
 from estimator.profiles.files import InvalidProfileFile
 from filter_service.psfs.store_file import PAGE_BYTES, PREAMBLE
+from tests.exports import irx3_export, vision_prescription
 from tests.schema_profiles import disturbed, drawn_profile
 from tests.unit.gltf_bytes import glb, triangle_bytes, triangle_header
 from tests.unit.image_bytes import (
@@ -512,7 +513,10 @@ def _lens_files() -> dict[str, bytes]:
     old = json.loads((DATA / "optiland_old_files.json").read_bytes())["files"]
     for version, eye in old.items():
         files[f"version_{version}.json"] = json.dumps(eye["json"]).encode()
-    return files
+    return files | {
+        "fhir.json": json.dumps(vision_prescription()).encode(),
+        "irx3.txt": irx3_export().encode("latin-1"),
+    }
 
 
 def _given_eyes() -> dict[str, bytes]:

@@ -304,7 +304,7 @@ def test_a_table_that_is_not_understood_is_refused(tmp_path, content, message):
         ("zos", "save the lens as .zmx"),
         ("roa", "as .zmx or with optiland"),
         ("xlsx", "save the sheet of one eye as .csv"),
-        ("txt", "rename a table of n,m,um to .csv"),
+        ("dat", "rename a table of n,m,um to .csv"),
     ],
 )
 def test_files_of_other_programs_are_refused_with_the_way_out(tmp_path, suffix, hint):
