@@ -140,9 +140,13 @@ class Display:
     @cached_property
     def camera(self) -> Camera:
         """Camera whose image is the picture."""
-        right = 0.5 * self.width_px * self.pitch_ratio
-        up = 0.5 * self.height_px * self.pitch_ratio
-        return Camera(self.width_px, self.height_px, (-right, right, up, -up))
+        focal_px = 1.0 / self.pitch_ratio
+        return Camera.from_intrinsics(
+            *(focal_px, focal_px),
+            *(0.5 * (self.width_px - 1), 0.5 * (self.height_px - 1)),
+            width_px=self.width_px,
+            height_px=self.height_px,
+        )
 
     def size_px(self, angle_arcmin: float) -> float:
         """Return the size in px of an angle about the middle of the picture."""

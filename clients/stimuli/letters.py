@@ -1,8 +1,8 @@
 """Optotypes and text: dark or bright shapes on a uniform background.
 
-The Landolt C and the tumbling E are the figures of ISO 8596: five units high, with
-strokes and gap of one unit.  Sloan letters are drawn on the same grid of 5 x 5 units.
-Heights are those of the letters; a letter of logMAR L is 5 · 10^L arcmin high.
+The Landolt C is that of ISO 8596: five units high, with stroke and gap of one unit.
+The tumbling E and Sloan letters are drawn on the same grid of 5 x 5 units.  Heights are
+those of the letters; a letter of logMAR L is 5 · 10^L arcmin high.
 """
 
 from __future__ import annotations
