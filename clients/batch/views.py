@@ -71,9 +71,12 @@ class Views:
     ) -> tuple[list[SourceFrame], States]:
         """Return each frame in each view, and the state of the eye in it.
 
-        Names of frames get a folder for each view if there are several.
+        The depth at the center of a frame is the distance of its pixels, if it is
+        given.  Names of frames get a folder for each view if there are several.
         """
         focus_dpt = None if None in self.foci_dpt else self.foci_dpt[0]
+        if focus_dpt is None and self.distances_dpt:
+            focus_dpt = self.distances_dpt[0]
         states = States(self.pupils_mm[0], focus_dpt)
         if self.count == 1:
             return list(frames), states
@@ -87,7 +90,8 @@ class Views:
                 one = replace(frame, name=f"{folder}/{frame.name}")
                 if view[0] is not None:
                     one = replace(one, depth_form=Constant(view[0]))
-                listed[one.name] = view[1], view[2]
+                focus_dpt = view[0] if view[2] is None else view[2]
+                listed[one.name] = view[1], focus_dpt
                 found.append(one)
         return found, replace(states, listed=listed)
 

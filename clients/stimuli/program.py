@@ -112,6 +112,9 @@ class StimulusSet:
                 ]
             )
             frames += own
+            if states.listed is None and len(self.stimuli) > 1:
+                state = states.pupil_mm, states.focus_dpt
+                states = replace(states, listed={one.name: state for one in own})
             listed |= states.listed or {}
         return frames, replace(states, listed=listed or None)
 

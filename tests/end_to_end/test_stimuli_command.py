@@ -112,29 +112,27 @@ def test_a_screen_has_other_pixels_at_each_distance(tmp_path):
     run(
         *("--grating-cpd", "3", "--size", "48x40", "--distance-m", "0.5,1"),
         *("--screen-width-mm", 531, "--screen-width-px", 1920, *QUICK),
-        *("-p", f"p={PERSON}", "--pupil-mm", "3,4", "-o", out),
+        *("-p", f"p={PERSON}", "--pupil-mm", "3", "-o", out),
     )
     near_arcmin = listing(out)["displays"]["distance0.5m"]["pixel_arcmin"]
     assert near_arcmin == pytest.approx(60 * math.degrees(0.531 / 1920 / 0.5), rel=1e-4)
-    found = {path.relative_to(out / "p").as_posix() for path in out.glob("p/*/*/*")}
-    name = "sine_3cpd_90deg_0deg_0.5.png"
-    assert found == {
-        f"pupil{mm}mm/distance{m}m/{name}" for mm in (3, 4) for m in (0.5, 1)
-    }
+    found = {path.relative_to(out / "p").as_posix() for path in out.glob("p/*/*")}
+    name = "sine_3cpd_90deg_0deg_0.5"
+    assert found == {f"distance{m}m/{name}.png" for m in (0.5, 1)}
     lines = (out / "manifest.jsonl").read_text().splitlines()
     focused = {
         record["frame"]: (record["pupil_mm"], record["focus_dpt"])
         for record in map(json.loads, lines[1:])
     }
-    assert focused[f"pupil3mm/distance0.5m/{name[:-4]}"] == pytest.approx((3.0, 2.0))
-    assert focused[f"pupil4mm/distance1m/{name[:-4]}"] == pytest.approx((4.0, 1.0))
+    assert focused[f"distance0.5m/{name}"] == pytest.approx((3.0, 2.0))
+    assert focused[f"distance1m/{name}"] == pytest.approx((3.0, 1.0))
 
 
 def test_steps_of_8_bits_are_noted_and_absent_from_exr(tmp_path):
     faint = ("--grating-cpd", "6", "--contrast", "0.02", *SMALL)
     assert "steps of 8-bit sRGB" in run(*faint, "-o", tmp_path / "png")
     told = run(*faint, "--format", "exr", "-o", tmp_path / "exr")
-    assert "note" not in told
+    assert "note:" not in told
     (path,) = (tmp_path / "exr/originals").iterdir()
     light = read_color(path)
     assert np.ptp(light) == pytest.approx(0.02, rel=0.02)

@@ -28,7 +28,8 @@ def test_one_view_leaves_names_as_they_are():
     views = Views.of("4", "3", "center")
     frames, states = views.of_frames(frames_of("a", "b"))
     assert [frame.name for frame in frames] == ["a", "b"]
-    assert states == States(3.0, None)
+    assert states == States(3.0, 0.25)
+    assert Views.of(None, "3", "center").of_frames(frames)[1] == States(3.0, None)
 
 
 def test_several_views_are_all_combinations_in_folders_of_their_values():
@@ -44,6 +45,8 @@ def test_several_views_are_all_combinations_in_folders_of_their_values():
     assert states.of(frame.name, depth_m) == (5.5, 0.25)
     assert states.of("distanceinfm_pupil3mm_focus0dpt/a", depth_m) == (3.0, 0.0)
     assert states.pupil_range_mm == (3.0, 5.5)
+    assert states.focus_range_dpt == (0.0, 0.25)
+    _, states = Views.of(None, "3", "1,center").of_frames(frames_of("a"))
     assert states.focus_range_dpt == (0.0, 10.0)  # of depth at the center
 
 
