@@ -2,37 +2,29 @@
 
     python examples/07_augment_data_set.py
 
-Images of letters at 4 m are filtered through eyes with random refraction, age and
+Images of Sloan letters at 4 m are filtered through eyes with random refraction, age and
 pupil.  The labels describe the eye of each image, so that a model can be trained on
 them too.  The example writes PNG files and labels.csv to out/examples/letters/.
 """
 
 import csv
-import string
 
 import numpy as np
-from common import OUT, font, save_pictures
-from PIL import Image, ImageDraw
+from common import OUT, save_pictures
+from PIL import Image
 
-from ocufilter import Camera, EyeFilter, FilterSettings
+from ocufilter import EyeFilter, FilterSettings, stimuli
 
-SIDE_PX = 64
-FIELD_DEG = 1.1  # height of the image; the letter corresponds to 20/200
+DISPLAY = stimuli.Display(width_px=96, height_px=96, pixel_arcmin=1.0)
+LETTER_ARCMIN = 50.0  # 20/200
 DISTANCE_DPT = 0.25  # 4 m
 LETTER_COUNT, PEOPLE_COUNT = 4, 6
 
 rng = np.random.default_rng(7)
-letters = rng.choice(list(string.ascii_uppercase), LETTER_COUNT, replace=False)
-
-
-def drawn(letter):
-    """Return an image of a letter, (height, width, 3) uint8."""
-    picture = Image.new("RGB", (SIDE_PX, SIDE_PX), "white")
-    place = (SIDE_PX / 2, SIDE_PX / 2)
-    ImageDraw.Draw(picture).text(
-        place, letter, fill="black", font=font(48), anchor="mm"
-    )
-    return np.array(picture)
+letters = {
+    letter: stimuli.sloan_letters(letter, height_arcmin=LETTER_ARCMIN, display=DISPLAY)
+    for letter in rng.choice(list("CDHKNORSVZ"), LETTER_COUNT, replace=False)
+}
 
 
 def person():
@@ -48,22 +40,21 @@ def person():
 
 folder = OUT / "letters"
 folder.mkdir(parents=True, exist_ok=True)
-camera = Camera.from_fov(FIELD_DEG, width_px=SIDE_PX, height_px=SIDE_PX)
-depth_m = np.full((SIDE_PX, SIDE_PX), 1.0 / DISTANCE_DPT, np.float32)
 settings = FilterSettings(
-    mode="on-axis",  # an image of one degree has the same PSF everywhere
+    mode="on-axis",  # an image of this size has the same PSF everywhere
     object_planes_dpt=(DISTANCE_DPT,),  # and a single distance
 )
 rows, pictures = [], []
-with EyeFilter("emmetropia", camera, settings) as eye:
+with EyeFilter("emmetropia", DISPLAY.camera, settings) as eye:
     for number in range(PEOPLE_COUNT):
         profile = person()
         pupil_mm = round(float(rng.uniform(2.5, 5.0)), 1)
         eye.set_profile(profile)
         eye.wait()
-        for letter in letters:
+        for letter, stimulus in letters.items():
             state = {"pupil_diameter_mm": pupil_mm, "focus_dpt": DISTANCE_DPT}
-            seen = eye.filter(drawn(letter), depth_m, **state, whole=True)
+            view = stimulus.view(1.0 / DISTANCE_DPT)
+            seen = eye.filter(view, **state, whole=True)
             file = f"{letter}_{number:02d}.png"
             Image.fromarray(seen.color).save(folder / file)
             rows.append(
@@ -77,5 +68,4 @@ with (folder / "labels.csv").open("w", newline="", encoding="utf-8") as file:
     writer.writeheader()
     writer.writerows(rows)
 print(f"{len(rows)} images, seen by {PEOPLE_COUNT} people, in {folder}")
-enlarged = [(text, picture.repeat(2, 0).repeat(2, 1)) for text, picture in pictures]
-save_pictures("07_augment_data_set.png", enlarged, columns=2 * LETTER_COUNT)
+save_pictures("07_augment_data_set.png", pictures, columns=2 * LETTER_COUNT)
