@@ -1,0 +1,174 @@
+"""Stimuli: time to draw them, their sizes in the pixels, and a set seen by people.
+
+    python -m tests.benchmarks.bench_stimuli [--quick] [--json]
+
+- ``letters``: heights of straight-ended letters, as the ink of each row, less the
+  heights that were asked for, in percent; the largest of 12 heights from 5 to 60 arcmin
+  and of 3 sizes of pixels.
+- ``areas``: heights of optotypes that follow from their area and closed forms.
+- ``gratings``: period and contrast of sinusoids, by a fit to the pixels.
+- ``text``: height of an x, as the ink of each row.
+- ``set``: 10 stimuli, 20 drawn persons and 2 pupils by one command, and the number of
+  frames that report a limit of blur (`blur_limited`).
+
+Writes results/stimuli.json.
+"""
+
+import argparse
+import json
+import math
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+
+from ocufilter import stimuli
+from tests.benchmarks.harness import Row, memory_mb, publish
+from tests.commands import run_command
+from tests.numerical.test_stimuli import (
+    AREAS,
+    display,
+    extent_arcmin,
+    fitted_wave,
+    ink,
+)
+
+PIXELS_ARCMIN = (0.25, 0.37, 0.5)
+HEIGHTS_ARCMIN = np.linspace(5.0, 60.0, 12).tolist()
+SIDE_PX = 256
+SET = (
+    *("--letters", "CDHK", "--height-arcmin", "10", "--landolt-c", "0,90"),
+    *("--grating-cpd", "4,8", "--square-cpd", "4", "--gabor-cpd", "6"),
+    *("--gabor-sd-arcmin", 8, "--pixel-arcmin", 0.5, "--size", "96x96"),
+    *("--distance-m", 4, "--pupil-mm", "3,5"),
+    *("-p", 'p={"kind": "prescription", "sphere_dpt": 0}'),
+)
+
+
+def _row(method, case, times_s, name, error, reference) -> Row:
+    median_ms, p95_ms = (1e3 * np.percentile(times_s, (50, 95))).tolist()
+    return Row(
+        *("stimuli", method, case, f"{SIDE_PX}x{SIDE_PX}", len(times_s)),
+        *(median_ms, p95_ms, memory_mb(), name, float(error), reference),
+    )
+
+
+def _sizes(draw, measure, heights_arcmin) -> tuple[list[float], float]:
+    """Return times and the largest error of heights, %."""
+    times_s, errors = [], []
+    for pixel_arcmin in PIXELS_ARCMIN:
+        pixels = display(pixel_arcmin, width_px=SIDE_PX, height_px=SIDE_PX)
+        for height_arcmin in heights_arcmin:
+            start_s = time.perf_counter()
+            found = draw(height_arcmin, pixels)
+            times_s.append(time.perf_counter() - start_s)
+            errors.append(abs(measure(found) / height_arcmin - 1.0))
+    return times_s, 100.0 * max(errors)
+
+
+def size_rows(heights_arcmin) -> list[Row]:
+    """Return a row for each kind of letter."""
+    rows = []
+    for letter in "DEHKNZ":
+
+        def draw(height_arcmin, pixels, letter=letter):
+            size = {"height_arcmin": height_arcmin, "display": pixels}
+            if letter == "E":
+                return stimuli.tumbling_e(0.0, **size)
+            return stimuli.sloan_letters(letter, **size)
+
+        times_s, error = _sizes(draw, lambda one: extent_arcmin(one, 0), heights_arcmin)
+        rows.append(
+            _row("letters", letter, times_s, "height_percent", error, "height asked")
+        )
+    for letter, turn_deg in (("C", 0.0), ("C", 45.0), ("C", 17.0), ("E", 90.0)):
+
+        def turned(height_arcmin, pixels, letter=letter, turn_deg=turn_deg):
+            draw = stimuli.landolt_c if letter == "C" else stimuli.tumbling_e
+            return draw(turn_deg, height_arcmin=height_arcmin, display=pixels)
+
+        def from_area(one, letter=letter):
+            area = ink(one).sum() * one.display.pixel_arcmin**2
+            return 5.0 * math.sqrt(area / AREAS[letter])
+
+        times_s, error = _sizes(turned, from_area, heights_arcmin)
+        case = f"{letter} at {turn_deg:g} deg"
+        rows.append(
+            _row("areas", case, times_s, "height_percent", error, "closed form")
+        )
+    times_s, error = _sizes(
+        lambda height_arcmin, pixels: stimuli.reading_text(
+            "xx", x_height_arcmin=height_arcmin / 2.0, display=pixels
+        ),
+        lambda one: 2.0 * extent_arcmin(one, 0),
+        [height for height in heights_arcmin if height >= 20.0 and height <= 40.0],
+    )
+    rows.append(_row("text", "xx", times_s, "x_height_percent", error, "height asked"))
+    return rows
+
+
+def grating_rows(frequencies_cpd) -> list[Row]:
+    """Return rows of the period and of the contrast."""
+    times_s, periods, contrasts = [], [], []
+    for pixel_arcmin in PIXELS_ARCMIN:
+        pixels = display(pixel_arcmin, width_px=SIDE_PX, height_px=SIDE_PX)
+        for frequency_cpd in frequencies_cpd:
+            for orientation_deg in (90.0, 30.0):
+                start_s = time.perf_counter()
+                found = stimuli.grating(
+                    frequency_cpd,
+                    display=pixels,
+                    orientation_deg=orientation_deg,
+                    phase_deg=20.0,
+                    contrast=0.4,
+                )
+                times_s.append(time.perf_counter() - start_s)
+                angle = math.radians(orientation_deg)
+                guess = np.array([math.sin(angle), -math.cos(angle)])
+                guess *= 1.0005 * frequency_cpd * pixel_arcmin / 60.0
+                mean, amplitude, right, up, _ = fitted_wave(
+                    found.light.astype(float), guess
+                )
+                period_arcmin = pixel_arcmin / math.hypot(right, up)
+                periods.append(abs(period_arcmin * frequency_cpd / 60.0 - 1.0))
+                contrasts.append(abs(abs(amplitude) / mean / 0.4 - 1.0))
+    return [
+        _row("gratings", case, times_s, name, 100.0 * max(errors), "fit to the pixels")
+        for case, name, errors in (
+            ("period", "period_percent", periods),
+            ("contrast", "contrast_percent", contrasts),
+        )
+    ]
+
+
+def set_row(people: int) -> Row:
+    """Return the time of a set, and its false alarms."""
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder) / "set"
+        start_s = time.perf_counter()
+        finished = run_command("stimuli", *SET, "--people", people, "-o", out)
+        took_s = time.perf_counter() - start_s
+        assert finished.returncode == 0, finished.stderr
+        lines = (out / "manifest.jsonl").read_text().splitlines()[1:]
+    frames = [json.loads(line) for line in lines]
+    alarms = sum("largest kernel" in " ".join(one["notes"]) for one in frames)
+    case = f"{len(frames)} frames, {took_s:.0f} s"
+    return _row("set", case, [took_s / len(frames)], "false_alarms", alarms, "0")
+
+
+def main() -> None:
+    """Run, print, and write results/stimuli.json."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--quick", action="store_true", help="few sizes and persons")
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    options = parser.parse_args()
+    heights = HEIGHTS_ARCMIN[3:4] if options.quick else HEIGHTS_ARCMIN
+    frequencies = (8.0,) if options.quick else (2.0, 5.5, 12.0, 30.0, 55.0)
+    rows = size_rows(heights) + grating_rows(frequencies)
+    rows.append(set_row(2 if options.quick else 20))
+    publish("stimuli", rows, as_json=options.json, is_whole=not options.quick)
+
+
+if __name__ == "__main__":
+    main()
