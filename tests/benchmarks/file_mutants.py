@@ -67,6 +67,16 @@ WIDE = (
     '# units: um\n"pupil_diameter_mm","wavelength_nm","eye","Z(2,0)","Z2_2","C3-1"\n'
     "6.0,555,OS,3.2,0.25,-0.125\n"
 )
+LISTED = {
+    "kind": "zernike",
+    "pupil_radius_mm": 2.5,
+    "wavelength_nm": 632.8,
+    "zernike": {"order": "noll", "unit": "waves", "values": [0, 0, 0, 2.5, 0, 0.1]},
+}
+NUMBERED = (
+    "# pupil_radius_mm: 2.5\n# wavelength_nm: 632.8\n# order: fringe\n"
+    "# normalization: none\n# positive: ahead\nj,waves\n4,2.5\n8,0.25\n"
+)
 ZMX_ENDING = (
     'BLNK\nOPDX 0 1 0 9.2E-1\nTOL TOFF   0   0 0\nMNUM 2 1\nMOFF   0   1 ""\n'
     "THIC   2   1 0.5 0 0\n"
@@ -197,6 +207,8 @@ def kinds(folder: Path) -> list[Kind]:
                 "sheet.csv": SHEET.encode(),
                 "windows.csv": SHEET.encode("utf-16"),
                 "wide.csv": WIDE.encode(),
+                "listed.json": json.dumps(LISTED).encode(),
+                "numbered.csv": NUMBERED.encode(),
             },
             profile,
             lambda path, beside: [*as_color, str(path), *_images(beside)],
