@@ -13,9 +13,9 @@ frame of the eye and positive where light is ahead.
     malacara   from 1, by n and from sines to cosines of an angle that is clockwise from
                +y; not normalized (Malacara, Optical Shop Testing, 2nd ed., table 13.2,
                1992)
-    born-wolf  from 1, by n and from m = n down to -n; not normalized; the "standard"
-               order of CODE V, after Born and Wolf, Principles of Optics, section 9.2,
-               who do not number the terms
+    born-wolf  from 1, by n and from m = n down to -n; not normalized; as in MACOS
+               (NASA JPL), after Born and Wolf, Principles of Optics, section 9.2, who
+               do not number the terms
     nm         radial order and azimuthal frequency (n,m) of OSA/ANSI instead of a
                number; sines have m < 0
 
@@ -114,10 +114,12 @@ def zernike_from(
     given = _listed(values, order)
     last = int(np.flatnonzero(_is_used(given)).max(initial=0))
     if last > place.max():
-        n, _, _ = term_of(order, last)
+        name = term_names(order, last + 1)[last]
+        if order == "fringe" and last >= N_FRINGE:
+            raise ValueError(f"fringe has no term {name}; allowed: 1 to {N_FRINGE}")
         raise ValueError(
-            f"{order} term {term_names(order, last + 1)[last]} has radial order {n}: "
-            f"must be 0 above order {HIGHEST_ORDER}"
+            f"{order} term {name} has radial order {term_of(order, last)[0]}: must be "
+            f"0 above order {HIGHEST_ORDER}"
         )
     is_given = (place >= 0) & (place < given.shape[-1])
     zernike_um = np.zeros((*given.shape[:-1], MAX_TERMS))

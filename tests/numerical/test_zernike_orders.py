@@ -179,6 +179,7 @@ def test_fringe_lacks_terms_above_the_fifth_order():
         ({"7": 1, 7: 2}, {"order": "osa"}, "osa term 7 is given twice"),
         ({"9" * 20: 1}, {"order": "osa"}, "osa has no term"),
         ([0] * 36 + [1], {"order": "fringe"}, "fringe term 37 has radial order 12"),
+        ({"38": 1}, {"order": "fringe"}, "fringe has no term 38; allowed: 1 to 37"),
         ([0] * 66 + [1], {"order": "noll"}, "noll term 67 has radial order 11"),
         ({"11,1": 1}, {"order": "nm"}, "nm term 11,1 has radial order 11"),
         ([0.0] * 232, {"order": "osa"}, r"shape \(232,\): allowed are 1 to 231"),
