@@ -141,6 +141,38 @@ class Straylight:
             np.trapezoid(self.per_sr(angles_deg) * ring_sr, np.radians(angles_deg))
         )
 
+    def transfer_ratio(self, frequency_cpd: ArrayLike) -> NDArray[np.float64]:
+        """Return the optical transfer (...) of the scattered light alone.
+
+        It is real, and equals `fraction` at frequency 0.  The transfer of the eye is
+        ``1 - fraction`` times that of its wavefront plus this.
+
+        Notes
+        -----
+        It is the integral of the light of a ring, 2 pi sin(angle), times the Bessel
+        function J0(2 pi f angle).  Between angles, light per angle is linear, and the
+        oscillating rest is integrated in closed form.
+        """
+        from scipy.special import itj0y0, j0, j1  # loads slowly
+
+        angles_deg = np.geomspace(SMALLEST_DEG, LARGEST_DEG, N_ANGLES)
+        sine = np.sin(np.radians(angles_deg)) * np.radians(1.0) / angles_deg
+        light = 2.0 * np.pi * self.per_sr(angles_deg) * sine
+        slope = np.diff(light) / np.diff(angles_deg)
+        cpd = np.asarray(frequency_cpd, dtype=np.float64)
+        found = np.full(cpd.shape, self.fraction)
+        for index in np.argwhere(cpd != 0.0):
+            k = 2.0 * np.pi * abs(float(cpd[tuple(index)]))
+            x = k * angles_deg
+            # antiderivatives of x J0(x) and x² J0(x), divided by powers of k
+            first = x * j1(x) / k**2
+            second = (x**2 * j1(x) + x * j0(x) - itj0y0(x)[0]) / k**3
+            constant = light[:-1] - slope * angles_deg[:-1]
+            found[tuple(index)] = float(
+                (constant * np.diff(first) + slope * np.diff(second)).sum()
+            )
+        return found
+
 
 REFERENCE_AGE_YEARS = 32.0
 """Age of the CIE standard observer, for which images are encoded."""

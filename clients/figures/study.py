@@ -21,7 +21,6 @@ from estimator import (
     EyeOptics,
     EyeProfile,
     FieldTable,
-    Lenslets,
     Rings,
     Transfer,
     best_correction_um,
@@ -432,8 +431,7 @@ class EyeStudy:
             "accommodation_dpt": used_dpt,
             "wavelength_nm": WAVELENGTH_NM,
         }
-        total_dpt = self.optics.total_defocus_dpt(**state)
-        total_dpt = total_dpt + self.optics.vergence.vergence_dpt(object_dpt)
+        total_dpt = self.optics.total_defocus_dpt(**state, object_dpt=object_dpt)
         seen = self.optics.wavefronts(
             h_deg=0.0, v_deg=0.0, **state, total_defocus_dpt=total_dpt
         )
@@ -460,11 +458,7 @@ class EyeStudy:
         if self.optics.rings is None:
             return None
         rings = self.optics.rings.seen_from(0.0, 0.0)
-        if not isinstance(rings, Lenslets):
-            return rings
-        clear_mm = rings.inner_mm - rings.diameter_mm / 2.0
-        reach_mm = np.hypot(*np.asarray(rings.centre_mm)) + circle_diameter_mm / 2.0
-        return None if reach_mm <= clear_mm else rings
+        return None if rings.is_clear(circle_diameter_mm / 2.0) else rings
 
     def acuity(self, pupil_diameter_mm: float) -> AcuityByDistance:
         """Return the acuity by distance through a pupil, cached because it is slow."""

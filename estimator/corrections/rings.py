@@ -184,6 +184,10 @@ class DiffractiveRings:
         """Return the lens unchanged: in the pupil it is the same for all fields."""
         return self
 
+    def is_clear(self, radius_mm: float) -> bool:
+        """Return whether a pupil of this radius sees no rings: never."""
+        return False
+
     def main_dpt(self, wavelength_nm: float) -> NDArray[np.float64]:
         """Return the power (n,) of orders with at least `MAIN_SHARE` of the light."""
         return self.added_dpt(wavelength_nm)[self._is_main(wavelength_nm)]
@@ -255,6 +259,10 @@ class RefractiveZones:
     def seen_from(self, h_deg: ArrayLike, v_deg: ArrayLike) -> "RefractiveZones":
         """Return the lens unchanged: in the pupil it is the same for all fields."""
         return self
+
+    def is_clear(self, radius_mm: float) -> bool:
+        """Return whether a pupil of this radius sees no rings: never."""
+        return False
 
     def main_dpt(self, wavelength_nm: float) -> NDArray[np.float64]:
         """Return the distinct powers (n,) of the zones."""
@@ -343,6 +351,14 @@ class Lenslets:
             h_deg, v_deg, vertex_mm=self.vertex_mm, gaze_deg=self.gaze_deg
         )
         return replace(self, centre_mm=-np.stack([x, y], axis=-1))
+
+    def is_clear(self, radius_mm: float) -> bool:
+        """Return whether a pupil of this radius is within the center, which is clear.
+
+        ``centre_mm`` is that of one direction, see `seen_from`.
+        """
+        offset_mm = float(np.hypot(*np.asarray(self.centre_mm)))
+        return offset_mm + radius_mm <= self.inner_mm - self.diameter_mm / 2.0
 
     def main_dpt(self, wavelength_nm: float) -> NDArray[np.float64]:
         """Return the power (1,) of the only sharp focus, due to the carrier lens."""

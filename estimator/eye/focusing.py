@@ -14,7 +14,7 @@ from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from estimator.corrections.rings import Rings
 from estimator.note import Note
@@ -68,6 +68,15 @@ class Focusing(ABC):
     @abstractmethod
     def largest_accommodation_dpt(self, pupil_diameter_mm: float) -> float:
         """Return the accommodation for the near point through a pupil."""
+
+    def with_object_dpt(
+        self, defocus_dpt: NDArray[np.float64], object_dpt: ArrayLike
+    ) -> NDArray[np.float64]:
+        """Return total defocus (...), dpt, with the vergence of an object added."""
+        if isinstance(object_dpt, float) and object_dpt == 0.0:
+            return defocus_dpt
+        at_dpt = np.asarray(object_dpt, dtype=np.float64)
+        return defocus_dpt + self.vergence.vergence_dpt(at_dpt)
 
     def accommodation_dpt(self, focus_dpt: float, *, pupil_diameter_mm: float) -> float:
         """Return the reachable accommodation that focuses a distance best."""

@@ -80,12 +80,14 @@ class EyeOptics(Protocol):
         pupil_diameter_mm: ArrayLike,
         accommodation_dpt: ArrayLike,
         wavelength_nm: ArrayLike,
+        object_dpt: ArrayLike = 0.0,
     ) -> NDArray[np.float64]:
-        """Return the least-squares refraction, dpt, for an object at infinity.
+        """Return the least-squares refraction, dpt, plus the vergence of an object.
 
         It has the broadcast shape, includes the correction and is on the circle of the
-        pupil.  `accommodation_dpt` focuses over the pupil itself, so at the focus of a
-        decentered pupil the total defocus is not 0: see "Focus" in CONVENTIONS.md.
+        pupil.  The object is at infinity by default.  `accommodation_dpt` focuses over
+        the pupil itself, so at the focus of a decentered pupil the total defocus is not
+        0: see "Focus" in CONVENTIONS.md.
 
         Raises
         ------

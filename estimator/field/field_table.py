@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from estimator.estimate.given_surfaces import EyeModel
 from estimator.field.prepare import prepare_eye
 from estimator.field.traced_eye import TracedEye
 from estimator.note import Note
@@ -107,23 +108,14 @@ def field_table(
         The eye cannot be traced, or not through a pupil of this diameter.
     """
     h_deg, v_deg = np.broadcast_arrays(np.atleast_1d(h_deg), np.atleast_1d(v_deg))
-    nodes_deg = np.unique(h_deg).astype(float), np.unique(v_deg).astype(float)
-    n_nodes = nodes_deg[0].size * nodes_deg[1].size
-    at_dpt = RELAXED_DPT if focus_dpt is None else focus_dpt
-    eye, notes = prepare_eye(
+    eye, notes = traced_directions(
         profile,
-        pupil_diameters_mm=[pupil_diameter_mm],
-        focus_range_dpt=(at_dpt, at_dpt),
-        wavelengths_nm=[wavelength_nm],
-        field_range_deg=((h_deg.min(), h_deg.max()), (v_deg.min(), v_deg.max())),
-        nodes_deg=nodes_deg if n_nodes <= MAX_NODES else None,
+        h_deg=h_deg,
+        v_deg=v_deg,
+        pupil_diameter_mm=pupil_diameter_mm,
+        wavelength_nm=wavelength_nm,
+        focus_dpt=focus_dpt,
     )
-    eye = cast(TracedEye, eye)  # the default of `prepare_eye`
-    if eye.usable_pupil_mm(pupil_diameter_mm) < pupil_diameter_mm:
-        raise ValueError(
-            f"pupil {pupil_diameter_mm:g} mm: light passes this eye up to "
-            f"{eye.max_pupil_diameter_mm:.3g} mm"
-        )
     states: dict[str, Any] = {
         "h_deg": h_deg,
         "v_deg": v_deg,
@@ -131,19 +123,10 @@ def field_table(
         "accommodation_dpt": eye.grid.accommodations_dpt[0],
         "wavelength_nm": wavelength_nm,
     }
-    total_dpt = eye.total_defocus_dpt(**states) + eye.vergence.vergence_dpt(object_dpt)
+    total_dpt = eye.total_defocus_dpt(**states, object_dpt=object_dpt)
     found = eye.wavefronts(**states, total_defocus_dpt=total_dpt)
-    if focus_dpt is not None:
-        view = {"pupil_diameter_mm": pupil_diameter_mm, "focus_dpt": focus_dpt}
-        notes = (*notes, *eye.notes(**view))
+    zernike_um = at_cornea_um(found, entrance_pupil_mm=eye.entrance_pupil_mm)
     radius_mm = found.circle_diameter_mm / 2.0
-    # `TracedEye` has wavefronts in the entrance pupil, instruments at the cornea.
-    at_cornea_um = moved_polynomial(
-        polynomial_in_mm(found.zernike_um, radius_mm),
-        depth_mm=-eye.entrance_pupil_mm,
-        radius_mm=radius_mm,
-    )
-    zernike_um = zernike_from_polynomial(at_cornea_um, radius_mm)
     return FieldTable(
         h_deg=h_deg,
         v_deg=v_deg,
@@ -153,8 +136,63 @@ def field_table(
         pupil_ellipse=found.pupil_ellipse,
         in_pupil=found,
         eye=eye,
-        notes=(*notes, *_edge_notes(eye, h_deg, v_deg)),
+        notes=notes,
     )
+
+
+def traced_directions(
+    profile: EyeProfile,
+    *,
+    h_deg: NDArray[Any],
+    v_deg: NDArray[Any],
+    pupil_diameter_mm: float,
+    wavelength_nm: float,
+    focus_dpt: float | None = None,
+    model: EyeModel | None = None,
+) -> tuple[TracedEye, tuple[str, ...]]:
+    """Return the eye traced in directions (n,) in one state, and notes on it.
+
+    The arguments are the same as for `field_table`; ``model`` is the eye of the
+    profile, if it is already known.
+    """
+    nodes_deg = np.unique(h_deg).astype(float), np.unique(v_deg).astype(float)
+    n_nodes = nodes_deg[0].size * nodes_deg[1].size
+    at_dpt = RELAXED_DPT if focus_dpt is None else focus_dpt
+    found, notes = prepare_eye(
+        profile,
+        pupil_diameters_mm=[pupil_diameter_mm],
+        focus_range_dpt=(at_dpt, at_dpt),
+        wavelengths_nm=[wavelength_nm],
+        field_range_deg=((h_deg.min(), h_deg.max()), (v_deg.min(), v_deg.max())),
+        nodes_deg=nodes_deg if n_nodes <= MAX_NODES else None,
+        model=model,
+    )
+    eye = cast(TracedEye, found)  # the default of `prepare_eye`
+    if eye.usable_pupil_mm(pupil_diameter_mm) < pupil_diameter_mm:
+        raise ValueError(
+            f"pupil {pupil_diameter_mm:g} mm: light passes this eye up to "
+            f"{eye.max_pupil_diameter_mm:.3g} mm"
+        )
+    if focus_dpt is not None:
+        view = {"pupil_diameter_mm": pupil_diameter_mm, "focus_dpt": focus_dpt}
+        notes = (*notes, *eye.notes(**view))
+    return eye, (*notes, *_edge_notes(eye, h_deg, v_deg))
+
+
+def at_cornea_um(
+    wavefronts: FieldWavefronts, *, entrance_pupil_mm: float
+) -> NDArray[np.float64]:
+    """Return wavefronts (n, n_terms) of the entrance pupil, moved to the cornea.
+
+    `TracedEye` has wavefronts in the entrance pupil, instruments at the cornea.
+    """
+    radius_mm = wavefronts.circle_diameter_mm / 2.0
+    polynomial_um = moved_polynomial(
+        polynomial_in_mm(wavefronts.zernike_um, radius_mm),
+        depth_mm=-entrance_pupil_mm,
+        radius_mm=radius_mm,
+    )
+    return zernike_from_polynomial(polynomial_um, radius_mm)
 
 
 def _edge_notes(

@@ -572,6 +572,7 @@ class FieldInterpolation:
         if not np.allclose(nodes_nm[index], wavelength_nm, rtol=1e-6, atol=0.0):
             raise ValueError(
                 f"wavelength_nm {np.unique(wavelength_nm).tolist()}: traced are "
-                f"{nodes_nm.tolist()}"
+                f"{nodes_nm.tolist()}; list others in `wavelengths_nm` of "
+                "`prepare_eye`, or use `Eye`, which traces any wavelength"
             )
         return index

@@ -272,6 +272,7 @@ def prepare_eye(
     field_range_deg: FieldRange = ON_AXIS_DEG,
     nodes_deg: FieldNodes | None = None,
     eye_model: str = "traced",
+    model: EyeModel | None = None,
     progress: Callable[[float, str], None] | None = None,
 ) -> tuple[EyeOptics, tuple[str, ...]]:
     """Return the eye of a profile over its visual field, and notes on it.
@@ -285,6 +286,7 @@ def prepare_eye(
     focus_range_dpt : (low, high)
         Range of focus distances that will be requested.
     wavelengths_nm : (n,)
+        Wavelengths that will be requested; red, green and blue by default.
     field_range_deg : ((h_low, h_high), (v_low, v_high))
         Azimuths and elevations.
     nodes_deg : (n_h,), (n_v,), optional
@@ -296,6 +298,8 @@ def prepare_eye(
         uses the measurement in closed form, at no cost, but does not model pupils
         larger than the measured one or the effect of accommodation on other
         aberrations.
+    model : EyeModel, optional
+        Result of `eye_model` for the profile, if it is already known.
     progress : callable, optional
         Callback with the completed fraction and a stage; may raise to cancel.
 
@@ -318,7 +322,7 @@ def prepare_eye(
 
     report = progress or (lambda fraction, stage: None)
     report(0.0, "eye")
-    estimated = model_of(profile)
+    estimated = model_of(profile) if model is None else model
     report(ESTIMATION_SHARE, "aberrations")
     eye = TracedEye.trace(
         estimated,

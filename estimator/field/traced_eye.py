@@ -289,8 +289,9 @@ class TracedEye(FocusingEye):
         pupil_diameter_mm: ArrayLike,
         accommodation_dpt: ArrayLike,
         wavelength_nm: ArrayLike,
+        object_dpt: ArrayLike = 0.0,
     ) -> NDArray[np.float64]:
-        """Return the least-squares refraction, dpt, for an object at infinity.
+        """Return the least-squares refraction, dpt, plus the vergence of an object.
 
         All arguments broadcast, and the result has their shape.
         """
@@ -298,7 +299,8 @@ class TracedEye(FocusingEye):
             h_deg, v_deg, pupil_diameter_mm, accommodation_dpt, wavelength_nm
         )
         zernike_um, _, radius_mm, number = self._distinct(states)
-        return total_defocus_dpt(zernike_um, radius_mm)[number].reshape(states[0].shape)
+        found_dpt = total_defocus_dpt(zernike_um, radius_mm)[number]
+        return self.with_object_dpt(found_dpt.reshape(states[0].shape), object_dpt)
 
     def defocus_at(
         self, *, h_deg: ArrayLike, v_deg: ArrayLike, wavelength_nm: ArrayLike

@@ -48,6 +48,14 @@ def at_cornea(lens: Prescription) -> Prescription:
     return Prescription(sphere_dpt, other_dpt - sphere_dpt, lens.axis_deg)
 
 
+def at_vertex(lens: Prescription, vertex_mm: float) -> Prescription:
+    """Convert a prescription at the cornea to a lens at a distance from it."""
+    moved = at_cornea(
+        Prescription(lens.sphere_dpt, lens.cylinder_dpt, lens.axis_deg, -vertex_mm)
+    )
+    return Prescription(moved.sphere_dpt, moved.cylinder_dpt, moved.axis_deg, vertex_mm)
+
+
 def format_prescription(lens: Prescription) -> str:
     """Format a prescription as "sphere cylinder x axis"."""
     text = f"{lens.sphere_dpt:+.2f}"

@@ -212,11 +212,12 @@ class MeasuredWavefront(FocusingEye):
         pupil_diameter_mm: ArrayLike,
         accommodation_dpt: ArrayLike,
         wavelength_nm: ArrayLike,
+        object_dpt: ArrayLike = 0.0,
     ) -> NDArray[np.float64]:
         """Return the least-squares refraction over the pupil, in dpt.
 
-        All arguments broadcast, and the result has their shape.  The object is at
-        infinity.
+        It includes the vergence of an object at ``object_dpt``.  All arguments
+        broadcast, and the result has their shape.
         """
         _, _, pupil_mm, used_dpt, wavelength_nm = np.broadcast_arrays(
             h_deg, v_deg, pupil_diameter_mm, accommodation_dpt, wavelength_nm
@@ -226,7 +227,8 @@ class MeasuredWavefront(FocusingEye):
             self.wavelength_nm
         )
         relaxed_dpt = total_defocus_dpt(self._on_circles(radius_mm), radius_mm)
-        return relaxed_dpt.reshape(pupil_mm.shape) + shift_dpt - used_dpt
+        found_dpt = relaxed_dpt.reshape(pupil_mm.shape) + shift_dpt - used_dpt
+        return self.with_object_dpt(found_dpt, object_dpt)
 
     def defocus_at(
         self, *, h_deg: ArrayLike, v_deg: ArrayLike, wavelength_nm: ArrayLike

@@ -319,9 +319,10 @@ def compute_psf_batch(
     method : {"auto", "fourier", "geometric", "enz", "enz_unchecked"}
         "auto" uses `switch.geometric_shares`.  "enz" raises outside the domain of the
         series; "enz_unchecked" does not, for tables that show where the series fails.
-    accuracy : {"normal", "fine"}
-        Relative L2 error of wave-optical PSFs: at most 3e-2 or 1e-2.  "enz" is always
-        "fine".
+    accuracy : {"normal", "fine", "finest"}
+        Accuracy of wave-optical PSFs.  The relative L2 error is at most 3e-2 or 1e-2;
+        the share of the light that is displaced is up to 0.012, 0.009 or 0.002.  "enz"
+        is always "fine".
     enz_degree : int
         Largest Zernike degree of the ENZ series; by default the paper's.
     diffraction : bool

@@ -44,7 +44,14 @@ ACCURACY = {
     "fine": FourierAccuracy(
         oversampling=2.0, min_samples_per_px=8, margin=16.0, filter_half_width=8
     ),
+    "finest": FourierAccuracy(
+        oversampling=2.0, min_samples_per_px=8, margin=64.0, filter_half_width=8
+    ),
 }
+
+
+class FftTooLong(ValueError):
+    """A PSF is too wide for the longest FFT of the wave method."""
 
 
 @dataclass(frozen=True)
@@ -87,7 +94,7 @@ def plan_grids(
 
     Raises
     ------
-    ValueError
+    FftTooLong
         A window exceeds the largest length.
     """
     margin_px = np.maximum(accuracy.margin * unit_px, MARGIN_PX)
@@ -99,7 +106,7 @@ def plan_grids(
     while True:
         wanted = window_px * samples_per_px
         if wanted.size and wanted.max() > lengths[-1]:
-            raise ValueError(
+            raise FftTooLong(
                 f"wave PSF needs an FFT of {wanted.max():.0f} samples; at most "
                 f"{lengths[-1]} are allowed: use the geometric method"
             )
