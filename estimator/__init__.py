@@ -1,6 +1,7 @@
 """Eye model, wavefronts and point-spread functions.
 
-From a profile to PSFs: `load_profile`, `estimate_eye` or `prepare_eye`, `compute_psfs`.
+`Eye` has the PSFs, the MTF and the acuity of a profile.  Step by step: `load_profile`,
+`estimate_eye` or `prepare_eye`, `compute_psfs`.
 
     optics/        light and surfaces
     wavefront/     ray-traced wavefronts of surfaces
@@ -15,6 +16,7 @@ From a profile to PSFs: `load_profile`, `estimate_eye` or `prepare_eye`, `comput
     periphery/     measured changes of wavefronts off the axis
     estimate/      estimation of an eye from a measurement
     field/         wavefronts of an eye over its visual field
+    image_quality/  PSF, MTF, refraction and acuity of an eye, with named axes
     native/        the compiled core: threads, PSFs
     note           notes for the user, with codes and numbers
     bounded_files  size-limited reading of untrusted text and JSON

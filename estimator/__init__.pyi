@@ -28,6 +28,8 @@ from .field.field_table import drawn_fields as drawn_fields
 from .field.field_table import field_table as field_table
 from .field.field_table import percentiles_of as percentiles_of
 from .field.prepare import prepare_eye as prepare_eye
+from .image_quality.eye import Eye as Eye
+from .image_quality.labeled_array import LabeledArray as LabeledArray
 from .optics.prescription import Prescription as Prescription
 from .optics.prescription import power_vector as power_vector
 from .optics.prescription import power_vector_from_zernike as power_vector_from_zernike

@@ -14,6 +14,7 @@ from estimator import Biometry as Biometry
 from estimator import DiffractiveRings as DiffractiveRings
 from estimator import DrawnFields as DrawnFields
 from estimator import EstimatedEye as EstimatedEye
+from estimator import Eye as Eye
 from estimator import EyeModel as EyeModel
 from estimator import EyeOptics as EyeOptics
 from estimator import EyeParameters as EyeParameters
@@ -21,6 +22,7 @@ from estimator import EyeProfile as EyeProfile
 from estimator import FieldTable as FieldTable
 from estimator import GivenSurfaces as GivenSurfaces
 from estimator import InvalidFile as InvalidFile
+from estimator import LabeledArray as LabeledArray
 from estimator import Lenslets as Lenslets
 from estimator import Prescription as Prescription
 from estimator import ProfileError as ProfileError

@@ -97,6 +97,10 @@ EYE_ROOMS = {
         *("native", "estimate", "networks", "periphery", "profiles"),
         *("eye", "corrections", "wavefront", "optics"),
     ),
+    "image_quality": (
+        *("field", "estimate", "profiles", "acuity", "media", "corrections", "psf"),
+        *("wavefront", "optics"),
+    ),
 }
 """From light to an eye over its field: each room knows only those before it."""
 
@@ -178,6 +182,7 @@ HOME = {
         "tests/*",  # plots of measurements
         "estimator/estimate/plot.py",  # `ocufilter estimate --plot`
         "estimator/field/field_table.py",  # `ocufilter field --plot`
+        "estimator/image_quality/*.py",  # `LabeledArray.plot`
         "training/learning_curve.py",
     ),
     "OpenEXR": ("filter_service/exr_files.py",),
@@ -194,6 +199,8 @@ HOME = {
         "clients/*",
     ),
     "rich": ("filter_service/progress.py", "clients/*", "training/*"),  # bars, tables
+    "pandas": ("estimator/image_quality/labeled_array.py",),  # on request
+    "xarray": ("estimator/image_quality/labeled_array.py",),
     "hypothesis": ("tests/*",),
     "pytest": ("tests/*",),
 }

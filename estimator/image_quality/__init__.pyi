@@ -1,0 +1,2 @@
+from .eye import Eye as Eye
+from .labeled_array import LabeledArray as LabeledArray
