@@ -149,7 +149,7 @@ def _command_line_page() -> str:
         "",
     ]
     main = _help()
-    names = re.findall(r"^  ([a-z]+)  ", main.partition("Commands:")[2], re.MULTILINE)
+    names = re.findall(r"^  ([a-z-]+)  ", main.partition("Commands:")[2], re.MULTILINE)
     for name in names:
         lines += [f"## ocufilter {name}", "", "```text", _help(name), "```", ""]
     return "\n".join(lines)

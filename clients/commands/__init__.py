@@ -8,6 +8,8 @@ correct_image  correct: a picture solved for a viewer
 eye            estimate and field: an eye and its visual field
 optics         wavefront and psf: an eye in one direction
 coefficients   coefficients in other orders, as wavefront and estimate print them
+image_quality  mtf, acuity and through-focus: an eye in lists of states
+state_options  options of such lists
 checkout       bench and paper, which need a checkout
 doctor         doctor: checks of this machine
 doctor_probes  probes that run in separate processes

@@ -1,6 +1,5 @@
 """`ocufilter estimate` and `field`: an eye's parameters and its visual field."""
 
-import math
 import sys
 from functools import partial
 from pathlib import Path
@@ -21,6 +20,7 @@ from clients.commands.optics import (
     Wavelength,
     ellipse_facts,
 )
+from clients.commands.state_options import listed_numbers
 from filter_service.command_line import (
     CommandFailed,
     Json,
@@ -146,7 +146,7 @@ def _report(summary: dict[str, Any], plot: Path | None) -> None:
         print_line(f"wrote the cross-section to {plot}")
 
 
-FIELD_LIMIT_DEG = 60.0
+FIELD_LIMITS_DEG = (-60.0, 60.0)
 MAX_DIRECTIONS = 10_000
 MAX_DRAWN_DIRECTIONS = 1_000_000
 """Largest number of persons times directions, whose quantities take 50 MB."""
@@ -204,7 +204,8 @@ def field(
     check_range("--wavelength-nm", wavelength_nm, WAVELENGTH_LIMITS_NM)
     if focus_dpt is not None:
         check_range("--focus-dpt", focus_dpt, FOCUS_LIMITS_DPT)
-    azimuths, elevations = _angles("--h-deg", h_deg), _angles("--v-deg", v_deg)
+    azimuths = listed_numbers("--h-deg", h_deg, FIELD_LIMITS_DEG)
+    elevations = listed_numbers("--v-deg", v_deg, FIELD_LIMITS_DEG)
     if len(azimuths) * len(elevations) > MAX_DIRECTIONS:
         raise ValueError(
             f"--h-deg and --v-deg: {len(azimuths)} x {len(elevations)} directions; "
@@ -293,29 +294,6 @@ def _drawn(
     with Progress(quiet=quiet or not sys.stderr.isatty()) as progress:
         task = progress.task("Drawn persons", total=people, unit="persons")
         return drawn_fields(eye, people, progress=task.advance, **states)
-
-
-def _angles(option: str, text: str) -> list[float]:
-    """Parse a list of angles in degrees.
-
-    Raises
-    ------
-    ValueError
-        If an angle is invalid.  The message names the option, the value and the range.
-    """
-    allowed = f"-{FIELD_LIMIT_DEG:g} to {FIELD_LIMIT_DEG:g}, separated by commas"
-    angles = []
-    for word in text.replace(",", " ").split():
-        try:
-            angle = float(word)
-        except ValueError:
-            angle = math.nan
-        if not abs(angle) <= FIELD_LIMIT_DEG:
-            raise ValueError(f"{option}: {word!r}; allowed: {allowed}")
-        angles.append(angle)
-    if not angles:
-        raise ValueError(f"{option} is empty; allowed: {allowed}")
-    return angles
 
 
 def _directions(found: "FieldTable") -> list[dict[str, Any]]:

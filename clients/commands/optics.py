@@ -22,6 +22,7 @@ from clients.commands.coefficients import (
     print_table,
     words,
 )
+from clients.commands.state_options import EyeName, states_of
 from filter_service.command_line import (
     CommandFailed,
     Json,
@@ -50,17 +51,18 @@ PSF_PUPIL_LIMITS_MM = (0.5, 9.0)
 PIXEL_LIMITS_ARCMIN = (0.05, 60.0)
 ARCMIN_PER_DEG = 60.0
 
+PSF_LIMITS = {
+    "pupil_mm": PSF_PUPIL_LIMITS_MM,
+    "wavelength_nm": WAVELENGTH_LIMITS_NM,
+    "h_deg": FIELD_LIMITS_DEG,
+    "v_deg": FIELD_LIMITS_DEG,
+    "focus_dpt": FOCUS_LIMITS_DPT,
+    "object_dpt": FOCUS_LIMITS_DPT,
+}
+
 MAX_RADIUS_PX = 1023
 """Largest radius of a kernel written to a file; the service has a lower limit."""
 
-Eye = Annotated[
-    str,
-    typer.Argument(
-        metavar="EYE",
-        help="Name of a preset or schematic eye, or a .json, .abp, .csv or .zmx "
-        "profile.",
-    ),
-]
 Pupil = Annotated[float, typer.Option(help="Entrance pupil, mm.")]
 Wavelength = Annotated[float, typer.Option(help="Wavelength, nm.")]
 Azimuth = Annotated[
@@ -80,7 +82,7 @@ Fit = Literal["opd", "slope"]
 
 
 def wavefront(
-    eye: Eye,
+    eye: EyeName,
     wavelength_nm: Wavelength,
     stop_mm: Annotated[
         float | None, typer.Option(help="Diameter of the iris, mm.")
@@ -338,37 +340,52 @@ class _State:
 
 
 def psf(
-    eye: Eye,
-    pupil_mm: Pupil,
-    wavelength_nm: Wavelength,
+    eye: EyeName,
+    pupil_mm: Annotated[str, typer.Option(metavar="LIST", help="Entrance pupils, mm.")],
+    wavelength_nm: Annotated[
+        str, typer.Option(metavar="LIST", help="Wavelengths, nm.")
+    ],
     pixel_arcmin: Annotated[float, typer.Option(help="Pixel size, arcmin.")],
     out: Annotated[
-        Path,
+        Path | None,
         typer.Option("--out", "-o", help="Output: .npy (kernel) or .png (log scale)."),
-    ],
-    object_dpt: Annotated[
-        float, typer.Option(help="Distance of the point source, dpt; 0 is infinity.")
-    ] = 0.0,
-    focus_dpt: Annotated[
-        float | None,
-        typer.Option(help="Focus distance, dpt; infinity if not given."),
     ] = None,
-    h_deg: Azimuth = 0.0,
-    v_deg: Elevation = 0.0,
+    object_dpt: Annotated[
+        str,
+        typer.Option(
+            metavar="LIST", help="Distances of the point source, dpt; 0 is infinity."
+        ),
+    ] = "0",
+    focus_dpt: Annotated[
+        str | None,
+        typer.Option(metavar="LIST", help="Focus, dpt; infinity if not given."),
+    ] = None,
+    h_deg: Annotated[
+        str,
+        typer.Option(metavar="LIST", help="Azimuths of the source; positive is right."),
+    ] = "0",
+    v_deg: Annotated[
+        str,
+        typer.Option(metavar="LIST", help="Elevations of the source; positive is up."),
+    ] = "0",
     method: Annotated[
         Method,
         typer.Option(
             help="auto selects a valid method for this wavefront; enz fails outside "
-            "the domain of its series."
+            "the domain of its series.  Lists require auto."
         ),
     ] = "auto",
     stiles_crawford: Annotated[
         bool,
         typer.Option("--stiles-crawford", help="Apply the Stiles-Crawford effect."),
     ] = False,
+    as_csv: Annotated[
+        bool,
+        typer.Option("--csv", help="Print comma-separated values, one PSF a line."),
+    ] = False,
     json_output: Json = False,
 ) -> None:
-    """Compute one PSF, integrated over pixels that are square in visual angle.
+    """Compute PSFs, integrated over pixels that are square in visual angle.
 
     The kernel is an array [y, x] in image orientation (rows grow downward), with the
     chief ray at its center and unit sum.  It is the PSF that the filter uses, for the
@@ -376,30 +393,71 @@ def psf(
     wavefront.  Off the axis, it is based on the most probable wavefront of people with
     the same wavefront on the axis.
 
+    A LIST is numbers separated by commas, or first:last:step.  Of lists, all
+    combinations are computed by wave optics and printed as a table; -o writes one array
+    with an axis for each list, in the order pupil, focus, object, wavelength after
+    azimuth and elevation, or a figure of all PSFs.
+
     ocufilter psf keratoconus --pupil-mm 5 --wavelength-nm 549
     --pixel-arcmin 1 --h-deg 20 -o psf.png
     """
-    check_range("--pupil-mm", pupil_mm, PSF_PUPIL_LIMITS_MM)
-    check_range("--wavelength-nm", wavelength_nm, WAVELENGTH_LIMITS_NM)
+    texts = {
+        "pupil_mm": pupil_mm,
+        "wavelength_nm": wavelength_nm,
+        "h_deg": h_deg,
+        "v_deg": v_deg,
+        "focus_dpt": focus_dpt,
+        "object_dpt": object_dpt,
+    }
+    states = states_of(PSF_LIMITS, **texts)
     check_range("--pixel-arcmin", pixel_arcmin, PIXEL_LIMITS_ARCMIN)
-    check_range("--object-dpt", object_dpt, FOCUS_LIMITS_DPT)
-    if focus_dpt is not None:
-        check_range("--focus-dpt", focus_dpt, FOCUS_LIMITS_DPT)
-    check_range("--h-deg", h_deg, FIELD_LIMITS_DEG)
-    check_range("--v-deg", v_deg, FIELD_LIMITS_DEG)
+    is_table = as_csv or any(isinstance(value, list) for value in states.values())
 
     from filter_service.image_files import check_output
 
-    check_output(out, (".npy", ".png"))
-    state = _state(
+    if out is not None:
+        check_output(out, (".npy", ".png"))
+    if is_table:
+        if method != "auto":
+            raise ValueError(f"--method is {method!r}; lists and --csv allow: auto")
+        from clients.commands.image_quality import print_psfs
+
+        print_psfs(
+            eye,
+            states,
+            out,
+            pixel_arcmin=pixel_arcmin,
+            stiles_crawford=stiles_crawford,
+            as_csv=as_csv,
+            json_output=json_output,
+        )
+        return
+    if out is None:
+        raise ValueError("--out is missing; allowed: a .npy or .png file, or --csv")
+    _one_psf(
         eye,
-        focus_dpt,
-        pupil_diameter_mm=pupil_mm,
-        object_dpt=object_dpt,
-        wavelength_nm=wavelength_nm,
-        h_deg=h_deg,
-        v_deg=v_deg,
+        states,
+        out,
+        pixel_arcmin=pixel_arcmin,
+        method=method,
+        stiles_crawford=stiles_crawford,
+        json_output=json_output,
     )
+
+
+def _one_psf(
+    eye: str,
+    states: dict[str, Any],
+    out: Path,
+    *,
+    pixel_arcmin: float,
+    method: str,
+    stiles_crawford: bool,
+    json_output: bool,
+) -> None:
+    """Write one PSF and print its facts."""
+    state = _state(eye, states.pop("focus_dpt", None), **states)
+    wavelength_nm = states["wavelength_nm"]
     computed, predicted_db = _compute(
         state,
         wavelength_nm=wavelength_nm,
@@ -416,8 +474,8 @@ def psf(
         "stiles_crawford": stiles_crawford,
         "wavelength_nm": wavelength_nm,
         "pixel_arcmin": pixel_arcmin,
-        "h_deg": h_deg,
-        "v_deg": v_deg,
+        "h_deg": states["h_deg"],
+        "v_deg": states["v_deg"],
     }
     if json_output:
         print_json(summary)

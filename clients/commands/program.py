@@ -67,7 +67,19 @@ COMMANDS = {
     ),
     "psf": (
         "clients.commands.optics:psf",
-        "Compute one PSF as an array or an image.",
+        "Compute PSFs as arrays or images.",
+    ),
+    "mtf": (
+        "clients.commands.image_quality:mtf",
+        "Print the modulation transfer function.",
+    ),
+    "acuity": (
+        "clients.commands.image_quality:acuity",
+        "Print visual acuity and the visual Strehl ratio.",
+    ),
+    "through-focus": (
+        "clients.commands.image_quality:through_focus",
+        "Print acuity and modulation by defocus.",
     ),
     "report": (
         "clients.report.program:report",

@@ -53,7 +53,7 @@ def figure_of(array: Any, *, quantity_axis: str, x: str | None = None) -> Figure
     long = [d for d in array.dims if array.sizes[d] > 1 and d != quantity_axis]
     if x is None and long:
         x = long[-1]
-    if x not in long:
+    if x is None or x not in long:
         raise ValueError(
             f"x {x!r}: expected an axis of more than one number: "
             f"{', '.join(long) or 'there is none'}"

@@ -98,7 +98,7 @@ def help_text():
 
 @pytest.mark.parametrize("name", COMMANDS)
 def test_every_command_has_help_and_a_summary_that_is_not_cut(help_text, name):
-    assert f"  {name:<9}  {COMMANDS[name][1]}\n" in help_text
+    assert f"  {name:<13}  {COMMANDS[name][1]}\n" in help_text
     shown = run_command(name, "--help")
     assert shown.returncode == 0, shown.stderr
     assert shown.stdout.startswith(f"Usage: ocufilter {name} ")

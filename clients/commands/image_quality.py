@@ -1,0 +1,298 @@
+"""`ocufilter mtf`, `acuity`, `through-focus` and lists of `psf`: an eye in states."""
+
+from __future__ import annotations
+
+import csv
+import math
+import sys
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from clients.commands.options import with_options
+from clients.commands.state_options import EyeName, StateOptions, listed_numbers
+from filter_service.command_line import Json, print_json, print_line
+
+if TYPE_CHECKING:
+    from estimator import LabeledArray
+
+Csv = Annotated[
+    bool, typer.Option("--csv", help="Print comma-separated values, one state a line.")
+]
+Plot = Annotated[Path | None, typer.Option(metavar="OUT.png", help="Plot the curves.")]
+WhiteLight = Annotated[
+    bool,
+    typer.Option(
+        "--white-light", help="White light instead of one wavelength; up to 60 cpd."
+    ),
+]
+
+FREQUENCIES = "0:60:5"
+DEFOCUS = "-2:2:0.25"
+FREQUENCY_LIMITS_CPD = (0.0, 1000.0)
+ORIENTATION_LIMITS_DEG = (-360.0, 360.0)
+DEFOCUS_LIMITS_DPT = (-20.0, 20.0)
+
+
+@dataclass(frozen=True)
+class MtfOptions(StateOptions):
+    """Options of `ocufilter mtf`."""
+
+    frequency_cpd: Annotated[
+        str, typer.Option(metavar="LIST", help="Frequencies, cycles per degree.")
+    ] = FREQUENCIES
+    orientation_deg: Annotated[
+        str | None,
+        typer.Option(
+            metavar="LIST",
+            help="Directions in which gratings vary: 0 for vertical bars, 90 for "
+            "horizontal ones; the mean of all if not given.",
+        ),
+    ] = None
+    white_light: WhiteLight = False
+    stiles_crawford: Annotated[
+        bool,
+        typer.Option("--stiles-crawford", help="Apply the Stiles-Crawford effect."),
+    ] = False
+    straylight: Annotated[
+        bool,
+        typer.Option("--straylight", help="Add the light that the media scatter."),
+    ] = False
+
+
+@dataclass(frozen=True)
+class ThroughFocusOptions(StateOptions):
+    """Options of `ocufilter through-focus`."""
+
+    defocus_dpt: Annotated[
+        str,
+        typer.Option(
+            metavar="LIST",
+            help="Vergence added in the pupil, dpt; positive is nearer.",
+        ),
+    ] = DEFOCUS
+    frequency_cpd: Annotated[
+        float, typer.Option(help="Frequency of the modulation, cycles per degree.")
+    ] = 15.0
+
+
+@with_options
+def mtf(
+    eye: EyeName,
+    options: MtfOptions,
+    as_csv: Csv = False,
+    plot: Plot = None,
+    json_output: Json = False,
+) -> None:
+    """Print the modulation transfer function of an eye.
+
+    All combinations of the lists are computed.  A LIST is numbers separated by commas,
+    or first:last:step.
+
+    ocufilter mtf emmetropia --pupil-mm 3,4,5 --csv
+    """
+    orientations = None
+    if options.orientation_deg is not None:
+        orientations = listed_numbers(
+            "--orientation-deg", options.orientation_deg, ORIENTATION_LIMITS_DEG
+        )
+    arguments = {
+        **options.states(),
+        "frequency_cpd": listed_numbers(
+            "--frequency-cpd", options.frequency_cpd, FREQUENCY_LIMITS_CPD
+        ),
+        "orientation_deg": orientations,
+        "white_light": options.white_light,
+        "stiles_crawford": options.stiles_crawford,
+        "straylight": options.straylight,
+    }
+    _check(plot)
+    from estimator import Eye
+
+    report(
+        eye,
+        Eye(eye).mtf(**arguments),
+        as_csv=as_csv,
+        plot=plot,
+        json_output=json_output,
+    )
+
+
+@with_options
+def acuity(
+    eye: EyeName,
+    options: StateOptions,
+    as_csv: Csv = False,
+    plot: Plot = None,
+    json_output: Json = False,
+) -> None:
+    """Print visual acuity in white light and the visual Strehl ratio.
+
+    log_mar is the acuity of an observer who reads letters through the optics with the
+    nerves of the fovea.  Off the axis, retina_log_mar, the limit by the density of
+    retinal cells, may be worse.  The visual Strehl ratio (VSOTF) is that of the
+    wavelength.  All combinations of the lists are computed.  A LIST is numbers
+    separated by commas, or first:last:step.
+
+    ocufilter acuity myopia --pupil-mm 3,5 --object-dpt 0:6:1
+    """
+    states = options.states()
+    _check(plot)
+    from estimator import Eye
+
+    found = Eye(eye).acuity(**states)
+    report(eye, found, as_csv=as_csv, plot=plot, json_output=json_output)
+
+
+@with_options
+def through_focus(
+    eye: EyeName,
+    options: ThroughFocusOptions,
+    as_csv: Csv = False,
+    plot: Plot = None,
+    json_output: Json = False,
+) -> None:
+    """Print acuity, visual Strehl ratio and modulation by defocus.
+
+    The defocus is added to the distance --object-dpt.  All combinations of the lists
+    are computed, at 0.2 to 0.5 s each.  A LIST is numbers separated by commas, or
+    first:last:step.
+
+    ocufilter through-focus emmetropia --pupil-mm 3 --defocus-dpt=-1,0,1
+    """
+    arguments = {
+        **options.states(),
+        "defocus_dpt": listed_numbers(
+            "--defocus-dpt", options.defocus_dpt, DEFOCUS_LIMITS_DPT
+        ),
+        "frequency_cpd": listed_numbers(
+            "--frequency-cpd", str(options.frequency_cpd), FREQUENCY_LIMITS_CPD
+        )[0],
+    }
+    _check(plot)
+    from estimator import Eye
+
+    found = Eye(eye).through_focus(**arguments)
+    report(eye, found, as_csv=as_csv, plot=plot, json_output=json_output)
+
+
+def print_psfs(
+    eye: str,
+    states: dict[str, Any],
+    out: Path | None,
+    *,
+    pixel_arcmin: float,
+    stiles_crawford: bool,
+    as_csv: bool,
+    json_output: bool,
+) -> None:
+    """Print a line for each PSF; write all of them."""
+    import numpy as np
+
+    from estimator import Eye, LabeledArray
+    from filter_service.atomic_files import replace_atomically
+    from filter_service.image_files import write_image
+    from filter_service.psfs.picture import half_light_radius_px
+
+    found = Eye(eye).psf(
+        pixel_arcmin=pixel_arcmin, stiles_crawford=stiles_crawford, **states
+    )
+    if out is not None and out.suffix.lower() == ".npy":
+        replace_atomically(out, lambda part: write_image(part, found.values))
+    elif out is not None:
+        figure = found.plot()
+        replace_atomically(out, lambda part: figure.savefig(part, format="png"))
+    kernels = found.values.reshape(-1, *found.shape[-2:])
+    facts = [
+        (half_light_radius_px(kernel) * pixel_arcmin, float(kernel.max()))
+        for kernel in kernels
+    ]
+    axes = ("y_arcmin", "x_arcmin")
+    table = LabeledArray(
+        np.array(facts).reshape(*found.shape[:-2], 2),
+        (*found.dims[:-2], "quantity"),
+        {
+            **{name: of for name, of in found.coords.items() if name not in axes},
+            "pixel_arcmin": np.array(pixel_arcmin),
+            "radius_arcmin": found.coords["x_arcmin"][-1],
+            "quantity": np.array(["half_light_radius_arcmin", "peak_ratio"]),
+        },
+        "psf",
+        notes=found.notes,
+    )
+    report(eye, table, as_csv=as_csv, json_output=json_output)
+    if out is not None and not as_csv and not json_output:
+        print_line(f"wrote {found.name} [{', '.join(found.dims)}] to {out}")
+
+
+def _check(plot: Path | None) -> None:
+    from filter_service.image_files import check_output
+
+    if plot is not None:
+        check_output(plot, (".png",))
+
+
+def report(
+    eye: str,
+    found: LabeledArray,
+    *,
+    as_csv: bool,
+    json_output: bool,
+    plot: Path | None = None,
+) -> None:
+    """Print an array as a table, CSV or JSON, and write its plot."""
+    if plot is not None:
+        from filter_service.atomic_files import replace_atomically
+
+        write = partial(found.plot().savefig, dpi=110, format="png")
+        replace_atomically(plot, write, is_private=True)
+    if json_output:
+        rows = [
+            dict(zip(found.columns(), map(_finite, row), strict=True))
+            for row in found.rows()
+        ]
+        print_json({"eye": eye, "rows": rows, "notes": list(found.notes)})
+    elif as_csv:
+        for note in found.notes:
+            print(f"note: {note}", file=sys.stderr)
+        _print_csv(found)
+    else:
+        _print_table(eye, found)
+
+
+def _finite(value: Any) -> Any:
+    """Return a value as JSON allows it: None for NaN."""
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _print_csv(found: LabeledArray) -> None:
+    writer = csv.writer(sys.stdout, lineterminator="\n")
+    writer.writerow(found.columns())
+    writer.writerows(found.rows())
+
+
+def _print_table(eye: str, found: LabeledArray) -> None:
+    """Print the columns that vary; the others are in the line before."""
+    for note in found.notes:
+        print_line(f"note: {note}")
+    fixed = [
+        f"{name} {values.item():g}"
+        for name, values in found.coords.items()
+        if values.ndim == 0
+    ]
+    print_line(f"{eye}: {', '.join(fixed)}")
+    shown = [
+        k
+        for k, name in enumerate(found.columns())
+        if name not in found.coords or found.coords[name].ndim
+    ]
+    names = [found.columns()[k] for k in shown]
+    print_line("  ".join(names))
+    for row in found.rows():
+        cells = [
+            f"{row[k]:>{len(name)}.4g}" for k, name in zip(shown, names, strict=True)
+        ]
+        print_line("  ".join(cells))

@@ -1,0 +1,160 @@
+"""Options for lists of states of an eye, and lists of numbers."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+import typer
+
+from filter_service.command_line import check_range
+
+EyeName = Annotated[
+    str,
+    typer.Argument(
+        metavar="EYE",
+        help="Name of a preset or schematic eye, or a .json, .abp, .csv or .zmx "
+        "profile.",
+    ),
+]
+
+MAX_NUMBERS = 10_000
+
+PUPIL_LIMITS_MM = (0.5, 12.0)
+WAVELENGTH_LIMITS_NM = (380.0, 780.0)
+FIELD_LIMITS_DEG = (-75.0, 75.0)
+DISTANCE_LIMITS_DPT = (-20.0, 20.0)
+
+FORM = "numbers separated by commas, or first:last:step"
+
+
+@dataclass(frozen=True)
+class StateOptions:
+    """States of an eye; each option is a list."""
+
+    pupil_mm: Annotated[
+        str, typer.Option(metavar="LIST", help="Entrance pupils at 555 nm, mm.")
+    ] = "4"
+    wavelength_nm: Annotated[
+        str, typer.Option(metavar="LIST", help="Wavelengths, nm, 380 to 780.")
+    ] = "555"
+    h_deg: Annotated[
+        str,
+        typer.Option(metavar="LIST", help="Azimuths of the source; positive is right."),
+    ] = "0"
+    v_deg: Annotated[
+        str,
+        typer.Option(metavar="LIST", help="Elevations of the source; positive is up."),
+    ] = "0"
+    focus_dpt: Annotated[
+        str | None,
+        typer.Option(metavar="LIST", help="Focus, dpt; infinity if not given."),
+    ] = None
+    object_dpt: Annotated[
+        str,
+        typer.Option(
+            metavar="LIST", help="Distances of the source, dpt; 0 is infinity."
+        ),
+    ] = "0"
+
+    def states(self) -> dict[str, Any]:
+        """Return the arguments of the methods of `Eye`.
+
+        Raises
+        ------
+        ValueError
+            A value is no number or out of range.
+        """
+        return states_of(
+            LIMITS,
+            pupil_mm=self.pupil_mm,
+            wavelength_nm=self.wavelength_nm,
+            h_deg=self.h_deg,
+            v_deg=self.v_deg,
+            focus_dpt=self.focus_dpt,
+            object_dpt=self.object_dpt,
+        )
+
+
+LIMITS = {
+    "pupil_mm": PUPIL_LIMITS_MM,
+    "wavelength_nm": WAVELENGTH_LIMITS_NM,
+    "h_deg": FIELD_LIMITS_DEG,
+    "v_deg": FIELD_LIMITS_DEG,
+    "focus_dpt": DISTANCE_LIMITS_DPT,
+    "object_dpt": DISTANCE_LIMITS_DPT,
+}
+
+
+def states_of(
+    limits: Mapping[str, tuple[float, float]], **texts: str | None
+) -> dict[str, Any]:
+    """Return arguments of the methods of `Eye` from the text of options.
+
+    Parameters
+    ----------
+    limits : mapping
+        Range of each option.
+    **texts
+        Lists by the name of the option.
+
+    Notes
+    -----
+    A list of one number becomes a number, which is no axis of the result.
+    """
+    found: dict[str, Any] = {}
+    for name, text in texts.items():
+        if text is None:
+            continue
+        values = listed_numbers(f"--{name.replace('_', '-')}", text, limits[name])
+        argument = "pupil_diameter_mm" if name == "pupil_mm" else name
+        found[argument] = values if len(values) > 1 else values[0]
+    return found
+
+
+def listed_numbers(option: str, text: str, limits: tuple[float, float]) -> list[float]:
+    """Parse a list: numbers separated by commas, or first:last:step.
+
+    Raises
+    ------
+    ValueError
+        A number is invalid.  The message names the option, the value and the range.
+    """
+    words = text.replace(",", " ").split()
+    if not words:
+        raise ValueError(f"{option} is empty; allowed: {FORM}")
+    found: list[float] = []
+    for word in words:
+        parts = [_number(option, part) for part in word.split(":")]
+        if len(parts) == 1:
+            found += parts
+        elif len(parts) == 3 and parts[2] != 0.0:
+            first, last, step = parts
+            count = math.floor((last - first) / step + 1e-9) + 1
+            if not 1 <= count <= MAX_NUMBERS:
+                raise ValueError(
+                    f"{option} is {word!r}: {max(count, 0)} numbers; allowed: 1 to "
+                    f"{MAX_NUMBERS}"
+                )
+            found += [round(first + k * step, 9) for k in range(count)]
+        else:
+            raise ValueError(f"{option} is {word!r}; allowed: {FORM}")
+    if len(found) > MAX_NUMBERS:
+        raise ValueError(
+            f"{option}: {len(found)} numbers; allowed: at most {MAX_NUMBERS}"
+        )
+    for value in found:
+        check_range(option, value, limits)
+    return found
+
+
+def _number(option: str, word: str) -> float:
+    try:
+        value = float(word)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise ValueError(f"{option} is {word!r}; allowed: {FORM}")
+    return value
