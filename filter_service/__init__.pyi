@@ -2,6 +2,10 @@ from .camera import Camera as Camera
 from .camera import tangents_from_fov as tangents_from_fov
 from .correcting.correction import Correction as Correction
 from .correcting.correction import correct as correct
+from .correcting.lens_scene import LensScene as LensScene
+from .correcting.lens_search import BestLens as BestLens
+from .correcting.lens_search import LensTrial as LensTrial
+from .correcting.lens_search import best_lens as best_lens
 from .correcting.sensitivity import SensitivityWeight as SensitivityWeight
 from .correcting.solver import PictureOperator as PictureOperator
 from .correcting.solver import PictureSolution as PictureSolution

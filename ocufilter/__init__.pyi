@@ -72,6 +72,7 @@ from estimator import zernike_to as zernike_to
 from estimator import zernike_values as zernike_values
 from filter_service import Accumulation as Accumulation
 from filter_service import BadMessage as BadMessage
+from filter_service import BestLens as BestLens
 from filter_service import BuildingEye as BuildingEye
 from filter_service import Camera as Camera
 from filter_service import ColorImage as ColorImage
@@ -87,6 +88,8 @@ from filter_service import FilterError as FilterError
 from filter_service import FilterOperator as FilterOperator
 from filter_service import FilterSettings as FilterSettings
 from filter_service import GlTexture as GlTexture
+from filter_service import LensScene as LensScene
+from filter_service import LensTrial as LensTrial
 from filter_service import Output as Output
 from filter_service import PictureOperator as PictureOperator
 from filter_service import PictureSolution as PictureSolution
@@ -97,6 +100,7 @@ from filter_service import SensitivityWeight as SensitivityWeight
 from filter_service import TextureView as TextureView
 from filter_service import ViewState as ViewState
 from filter_service import as_views as as_views
+from filter_service import best_lens as best_lens
 from filter_service import correct as correct
 from filter_service import errors as errors
 from filter_service import image_derivatives as image_derivatives

@@ -1,5 +1,9 @@
 from .correction import Correction as Correction
 from .correction import correct as correct
+from .lens_scene import LensScene as LensScene
+from .lens_search import BestLens as BestLens
+from .lens_search import LensTrial as LensTrial
+from .lens_search import best_lens as best_lens
 from .sensitivity import SensitivityWeight as SensitivityWeight
 from .solver import PictureOperator as PictureOperator
 from .solver import PictureSolution as PictureSolution

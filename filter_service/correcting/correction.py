@@ -197,7 +197,7 @@ def correct(
         )
     state = State.checked(pupil_diameter_mm, focus_dpt)
     viewers = _as_profiles(viewer)
-    _check_choice("metric", metric, METRICS)
+    check_choice("metric", metric, METRICS)
     check_number("contrast", contrast, CONTRAST_LIMITS)
     check_number("tolerance", tolerance, TOLERANCE_LIMITS)
     check_number("max_iterations", max_iterations, (1, MAX_ITERATIONS))
@@ -450,7 +450,8 @@ def _as_profiles(viewer: Profile | Sequence[Profile]) -> tuple[Profile, ...]:
     return tuple(viewer)
 
 
-def _check_choice(field: str, value: object, allowed: tuple[str, ...]) -> None:
+def check_choice(field: str, value: object, allowed: tuple[str, ...]) -> None:
+    """Raise BadMessage unless a value is one of the allowed ones."""
     if value not in allowed:
         raise BadMessage(
             f"it is {value!r:.60}", field=field, allowed=" or ".join(allowed)
