@@ -53,7 +53,7 @@ class LensScene:
     pupil_diameter_mm : float
     focus_dpt : float, optional
         Distance of focus; by default, the eye focuses each distance in the scene.
-    weight : float
+    weight_ratio : float
         Weight of the scene's error in the mean over the scenes.
     gaze_deg : (h, v)
         Direction of the camera's axis relative to the head, where the line of sight
@@ -63,7 +63,7 @@ class LensScene:
     view: RgbdView
     pupil_diameter_mm: float
     focus_dpt: float | None = None
-    weight: float = 1.0
+    weight_ratio: float = 1.0
     gaze_deg: tuple[float, float] = (0.0, 0.0)
 
 
@@ -183,5 +183,5 @@ def checked_scenes(scenes: LensScene | Sequence[LensScene]) -> list[LensScene]:
                 f"a {type(scene).__name__}", field=f"scenes[{k}]", allowed="a LensScene"
             )
         State.checked(scene.pupil_diameter_mm, scene.focus_dpt or 0.0, scene.gaze_deg)
-        check_number(f"scenes[{k}].weight", scene.weight, WEIGHT_LIMITS)
+        check_number(f"scenes[{k}].weight_ratio", scene.weight_ratio, WEIGHT_LIMITS)
     return found

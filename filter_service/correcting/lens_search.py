@@ -62,6 +62,7 @@ SCAN_DPT = (-1.0, -0.5, 0.0, 0.5, 1.0)
 FIRST_RADIUS_DPT, LAST_RADIUS_DPT = 0.5, 0.01
 """Radii of the trust region, of the first and of the last steps."""
 
+LEAST_ERROR = 1e-30
 BOUND_DPT = 20.0
 ADD_LIMITS_DPT = 0.25, 4.0
 FIRST_ADD_DPT = 2.0
@@ -78,13 +79,14 @@ class LensTrial:
         Power of the lens in its own plane, with minus cylinder.
     add_dpt : float
         Addition of a progressive lens; 0 otherwise.
-    error : float
-        Weighted mean of the scenes' errors, by the measure.
+    error_db : float
+        Weighted mean of the scenes' mean square differences by the measure; 0 dB is the
+        square of white.
     """
 
     prescription: Prescription
     add_dpt: float
-    error: float
+    error_db: float
 
 
 @dataclass(frozen=True)
@@ -102,7 +104,7 @@ class BestLens:
     start : LensTrial
         The lens with the highest visual Strehl ratio, which does not depend on the
         scene, for the farthest focus.
-    error_before : float
+    error_before_db : float
         Error through the profile as it is given.
     trials : tuple of LensTrial
         All lenses in the order of the search.
@@ -119,7 +121,7 @@ class BestLens:
     best: LensTrial
     rounded: LensTrial
     start: LensTrial
-    error_before: float
+    error_before_db: float
     trials: tuple[LensTrial, ...]
     correction: dict[str, Any]
     rounded_correction: dict[str, Any]
@@ -133,17 +135,17 @@ class BestLens:
     @property
     def gain_db(self) -> float:
         """Return the reduction of the error by the lens, dB."""
-        return _ratio_db(self.error_before, self.best.error)
+        return self.error_before_db - self.best.error_db
 
     @property
     def gain_over_start_db(self) -> float:
         """Return the reduction of the error relative to that of the start, dB."""
-        return _ratio_db(self.start.error, self.best.error)
+        return self.start.error_db - self.best.error_db
 
     @property
     def rounding_loss_db(self) -> float:
         """Return the increase of the error by rounding the lens, dB."""
-        return _ratio_db(self.rounded.error, self.best.error)
+        return self.rounded.error_db - self.best.error_db
 
 
 def best_lens(
@@ -286,16 +288,16 @@ class _Search:
                 target = self._image(self._target_eye, sight, is_refraction=False)[0]
             sight.target = target
         images, notes = self._images(self._eye)
-        error_before, before = self._error(images), images[0]
+        error_before_db, before = self._error_db(images), images[0]
         notes = [*dict.fromkeys(note for note in notes if not _is_of_focus(note))]
         report("start")
         first = self._start()
         n_powers = 3 if self._has_cylinder else 1
 
         def error_db(x: NDArray[np.float64]) -> float:
-            error = self._try(x).error
+            trial = self._try(x)
             report("lenses")
-            return 10.0 * math.log10(max(error, 1e-30))
+            return trial.error_db
 
         x0 = np.array(first[:n_powers])
         if self._is_progressive:
@@ -321,7 +323,7 @@ class _Search:
                 "maxfev": max_evaluations - len(self.trials),
             },
         )
-        best = min(self.trials, key=lambda trial: trial.error)
+        best = min(self.trials, key=lambda trial: trial.error_db)
         rounded = rounded_prescription(best.prescription)
         add_dpt = best.add_dpt and _in_steps(best.add_dpt, POWER_STEP_DPT)
         rounded_body = self._body_of(rounded, add_dpt)
@@ -332,9 +334,9 @@ class _Search:
         report("lenses")
         return BestLens(
             best=best,
-            rounded=LensTrial(rounded, add_dpt, self._error(rounded_images)),
+            rounded=LensTrial(rounded, add_dpt, self._error_db(rounded_images)),
             start=start,
-            error_before=error_before,
+            error_before_db=error_before_db,
             trials=tuple(self.trials),
             correction=body,
             rounded_correction=rounded_body,
@@ -393,7 +395,7 @@ class _Search:
             (float(m_dpt), float(j0_dpt), float(j45_dpt)), vertex_mm=self._vertex_mm
         )
         eye = self._eye_with(self._body_of(prescription, add_dpt))
-        trial = LensTrial(prescription, add_dpt, self._error(self._images(eye)[0]))
+        trial = LensTrial(prescription, add_dpt, self._error_db(self._images(eye)[0]))
         self.trials.append(trial)
         return trial
 
@@ -434,11 +436,12 @@ class _Search:
             notes += own_notes
         return found, notes
 
-    def _error(self, images: Sequence[NDArray[np.float32]]) -> float:
-        """Return the weighted mean of the errors of the scenes' images."""
+    def _error_db(self, images: Sequence[NDArray[np.float32]]) -> float:
+        """Return the weighted mean of the errors of the scenes' images, dB."""
         errors = [s.error(image) for s, image in zip(self._sights, images, strict=True)]
-        weights = [sight.scene.weight for sight in self._sights]
-        return float(np.average(errors, weights=weights))
+        weights = [sight.scene.weight_ratio for sight in self._sights]
+        mean = float(np.average(errors, weights=weights))
+        return 10.0 * math.log10(max(mean, LEAST_ERROR))
 
     def _image(
         self, eye: EyeProfile, sight: Sight, *, is_refraction: bool
@@ -519,10 +522,6 @@ def rounded_prescription(lens: Prescription) -> Prescription:
 
 def _in_steps(value: float, step: float) -> float:
     return round(value / step) * step
-
-
-def _ratio_db(above: float, below: float) -> float:
-    return 10.0 * math.log10(max(above, 1e-30) / max(below, 1e-30))
 
 
 def _is_of_focus(note: str) -> bool:
