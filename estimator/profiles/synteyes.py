@@ -32,7 +32,7 @@ from estimator.note import Note
 from estimator.optics.forms import TwoConics
 from estimator.optics.media import OCULAR_MEDIA, OcularHerzberger
 from estimator.optics.surfaces import EyeSurfaces, Retina, Surface
-from estimator.optics.units import MM_PER_M, REFERENCE_WAVELENGTH_NM
+from estimator.optics.units import MM_PER_M, REFERENCE_WAVELENGTH_NM, UM_PER_MM
 from estimator.optics.zernike import (
     N_TERMS,
     flip_horizontal,
@@ -62,8 +62,6 @@ RETINA_THICKNESS_MM = 0.2
 """Part of the axial length behind the ellipsoid whose semi-axes are known."""
 
 KERATOMETER_INDEX, KERATOMETER_RADIUS_MM = 1.3375, 1.5
-
-UM = 1e-3
 
 
 @dataclass(frozen=True)
@@ -173,7 +171,7 @@ def biometry_of(
     retina_semi_axes_mm : (x, y, z)
     """
     model = _model()
-    cornea_mm = model.cornea_mean_mm + UM * model.cornea_vectors @ parameters[6:]
+    cornea_mm = model.cornea_mean_mm + model.cornea_vectors @ parameters[6:] / UM_PER_MM
     aqueous, lens, length, anterior, posterior, power = parameters[:6].tolist()
     return Biometry(
         cornea_thickness_mm=float(cornea_mm[-1]),
