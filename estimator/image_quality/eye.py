@@ -41,7 +41,7 @@ from estimator.media import DEFAULT_AGE_YEARS, Straylight
 from estimator.optics.units import MRAD_PER_RAD
 from estimator.profiles.files import load_profile
 from estimator.profiles.parse import EyeProfile, parse_profile
-from estimator.psf.compute import plan_psfs
+from estimator.psf.compute import disc_mask, plan_psfs
 from estimator.psf.stiles_crawford import StilesCrawford
 
 FREQUENCY_CPD = np.arange(61.0)
@@ -191,16 +191,16 @@ class Eye:
         """Return point-spread functions integrated over pixels.
 
         The axes ``y_arcmin`` and ``x_arcmin`` follow those of the states, in image
-        orientation: rows grow downward.  The chief ray is at 0, 0.  The light of a PSF
-        has unit sum.
+        orientation: rows grow downward.  The chief ray is at 0, 0.  Values are shares
+        of the light.
 
         Parameters
         ----------
         pixel_arcmin : float
             Side of a pixel.
         radius_arcmin : float, optional
-            Radius of the disc of pixels; by default, the largest one that a state
-            requires for 99.9 % of its light.
+            Radius of the disc of pixels.  By default, it is the largest one that a
+            state requires for 99.9 % of its light, and the sum is 1.
         white_light : bool
             Whether the light is white, with the wavefront of ``wavelength_nm``; it
             includes the centered Stiles-Crawford effect.
@@ -225,8 +225,15 @@ class Eye:
             stiles_crawford=self._apodization(stiles_crawford),
             pupil_screen=screen,
         )
-        radius_px = _radius_px(radius_arcmin, pixel_arcmin, batches)
-        side = 2 * radius_px + 1
+        needed_px = max(int(plan_psfs(**batch).radius_px.max()) for _, batch in batches)
+        radius_px = needed_px
+        if radius_arcmin is not None:
+            limits = 0.0, MAX_PSF_RADIUS_PX * pixel_arcmin
+            listed("radius_arcmin", float(radius_arcmin), limits)
+            radius_px = round(radius_arcmin / pixel_arcmin)
+        # A kernel that is narrower than its light contains an image of the rest.
+        computed_px = max(needed_px, radius_px)
+        side = 2 * computed_px + 1
         if grid.count * side**2 > MAX_PSF_VALUES:
             raise ValueError(
                 f"{grid.count} PSFs of {side} x {side} pixels: expected at most "
@@ -234,8 +241,11 @@ class Eye:
             )
         kernels = np.zeros((grid.count, side, side), np.float32)
         for weight, batch in batches:
-            found = finest_psfs(**batch, radius_px=radius_px)
+            found = finest_psfs(**batch, radius_px=computed_px)
             kernels += np.float32(weight) * found.flat_kernels.reshape(kernels.shape)
+        if radius_px < computed_px:
+            kept = slice(computed_px - radius_px, computed_px + radius_px + 1)
+            kernels = kernels[:, kept, kept] * disc_mask(radius_px)
         along = np.arange(-radius_px, radius_px + 1) * pixel_arcmin
         if straylight:
             scatter = self.straylight
@@ -541,16 +551,3 @@ class Eye:
         """Return transfers of the optics with the light that the media scatter."""
         scatter = self.straylight
         return (1.0 - scatter.fraction) * values + scatter.transfer_ratio(frequency_cpd)
-
-
-def _radius_px(
-    radius_arcmin: float | None,
-    pixel_arcmin: float,
-    batches: Sequence[tuple[float, dict[str, Any]]],
-) -> int:
-    """Return the radius of PSFs in pixels, as given or as the widest one requires."""
-    if radius_arcmin is None:
-        return max(int(plan_psfs(**batch).radius_px.max()) for _, batch in batches)
-    largest_arcmin = MAX_PSF_RADIUS_PX * pixel_arcmin
-    listed("radius_arcmin", float(radius_arcmin), (0.0, largest_arcmin))
-    return round(radius_arcmin / pixel_arcmin)

@@ -19,6 +19,7 @@ from scipy.special import j1
 from estimator.acuity.best_correction import best_correction_um
 from estimator.acuity.predict import TILTS, Acuity, predict_acuity
 from estimator.acuity.transfer import (
+    FREQUENCY_STEP_CPD,
     WHITE_LIGHT,
     SteepWavefront,
     Transfer,
@@ -143,7 +144,10 @@ class PupilLight:
             The pupil is covered by lenslets.
         """
         if white_light:
-            return white_light_transfer(self.zernike_um, **self._pupil)
+            # With the coarser steps of acuity, the modulation is off by up to 0.007.
+            return white_light_transfer(
+                self.zernike_um, **self._pupil, frequency_step_cpd=FREQUENCY_STEP_CPD
+            )
         return optical_transfer(
             self.zernike_um, **self._pupil, stiles_crawford=stiles_crawford
         )

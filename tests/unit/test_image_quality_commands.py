@@ -1,0 +1,151 @@
+"""`ocufilter mtf`, `acuity`, `through-focus`, and `psf` of lists of states."""
+
+import csv
+import json
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from clients.commands.state_options import listed_numbers
+from estimator import Eye
+from tests.commands import run_command
+
+PSF = ["--wavelength-nm", "555", "--pixel-arcmin", "1"]
+
+
+def printed(*arguments):
+    ended = run_command(*arguments)
+    assert ended.returncode == 0, ended.stderr
+    return ended.stdout
+
+
+def rows_of(text):
+    return list(csv.DictReader(text.splitlines()))
+
+
+@pytest.mark.long("transfer functions of three pupils")
+def test_an_mtf_table_of_three_pupils_is_one_command():
+    words = ("mtf", "emmetropia", "--pupil-mm", "3,4,5", "--frequency-cpd", "10,20")
+    rows = rows_of(printed(*words, "--csv"))
+    expected = Eye("emmetropia").mtf(
+        frequency_cpd=[10, 20], pupil_diameter_mm=[3, 4, 5]
+    )
+    assert len(rows) == 6
+    for row, values in zip(rows, expected.rows(), strict=True):
+        assert [float(cell) for cell in row.values()] == pytest.approx(values, abs=1e-9)
+    assert list(rows[0]) == expected.columns()
+
+    text = printed(*words, "--pupil-mm", "2,3")
+    assert "pupil_diameter_mm  frequency_cpd  modulation_ratio" in text
+    assert "emmetropia: h_deg 0, v_deg 0, focus_dpt 0, object_dpt 0" in text
+    found = json.loads(printed(*words, "--pupil-mm", "3", "--json"))
+    assert found["rows"][1]["modulation_ratio"] == pytest.approx(
+        float(rows[1]["modulation_ratio"])
+    )
+    assert found["eye"] == "emmetropia"
+
+
+@pytest.mark.long("five transfer functions and a figure")
+def test_options_of_light_change_the_mtf(tmp_path):
+    words = ("mtf", "emmetropia", "--frequency-cpd", "20", "--csv", "--pupil-mm", "2")
+    values = [
+        float(rows_of(printed(*words, *option))[0]["modulation_ratio"])
+        for option in (
+            (),
+            ("--orientation-deg", "0"),
+            ("--white-light",),
+            ("--stiles-crawford",),
+            ("--straylight",),
+        )
+    ]
+    assert len(set(values)) == 5
+    out = tmp_path / "mtf.png"
+    printed(
+        "mtf",
+        "emmetropia",
+        "--frequency-cpd",
+        "0:60:20",
+        "--pupil-mm",
+        "2",
+        "--plot",
+        out,
+    )
+    assert np.asarray(Image.open(out)).std() > 10.0
+
+
+@pytest.mark.long("acuity at two distances and three defoci")
+def test_acuity_and_through_focus_have_a_column_for_each_quantity():
+    rows = rows_of(printed("acuity", "myopia", "--object-dpt", "0,6", "--csv"))
+    far, near = (float(row["log_mar"]) for row in rows)
+    assert near < 0.0 < 0.8 < far
+    words = ("through-focus", "emmetropia", "--defocus-dpt=-1:1:1", "--csv")
+    rows = rows_of(printed(*words))
+    assert [float(row["defocus_dpt"]) for row in rows] == [-1.0, 0.0, 1.0]
+    assert list(rows[0])[-3:] == ["log_mar", "visual_strehl_ratio", "modulation_ratio"]
+
+
+@pytest.mark.long("PSFs of six states and their figure")
+def test_psfs_of_lists_are_a_table_and_one_array(tmp_path):
+    out = tmp_path / "psf.npy"
+    words = ("psf", "emmetropia", "--pupil-mm", "3,5", "--h-deg", "0,20,30", *PSF)
+    rows = rows_of(printed(*words, "-o", out, "--csv"))
+    kernels = np.load(out)
+    assert kernels.shape[:2] == (3, 2)  # direction, pupil
+    np.testing.assert_allclose(kernels.sum(axis=(-1, -2)), 1.0, atol=1e-5)
+    assert [float(row["peak_ratio"]) for row in rows] == pytest.approx(
+        kernels.max(axis=(-1, -2)).ravel()
+    )
+    assert float(rows[0]["half_light_radius_arcmin"]) < 1.5
+    text = printed(*words, "-o", tmp_path / "psf.png")
+    assert "wrote light_ratio [h_deg, pupil_diameter_mm, y_arcmin, x_arcmin]" in text
+    assert np.asarray(Image.open(tmp_path / "psf.png")).shape[0] > 400
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("mtf emmetropia --pupil-mm 3,40", "--pupil-mm is 40; allowed: 0.5 to 12 mm"),
+        ("mtf emmetropia --wavelength-nm 0.555", "(0.555 um is 555 nm)"),
+        ("mtf emmetropia --frequency-cpd 0:60", "--frequency-cpd is '0:60'; allowed: "),
+        ("acuity emmetropia --object-dpt near", "--object-dpt is 'near'; allowed: "),
+        ("acuity nobody", "'nobody'"),
+        ("mtf emmetropia --plot a.jpg", "a.jpg"),
+        ("psf myopia --pupil-mm 3", "--wavelength-nm"),
+        (
+            "psf myopia --pupil-mm 3 --wavelength-nm 555 --pixel-arcmin 1",
+            "--out is mis",
+        ),
+        (
+            "psf myopia --pupil-mm 3,4 --wavelength-nm 555 --pixel-arcmin 1 "
+            "--method enz",
+            "--method is 'enz'; lists and --csv allow: auto",
+        ),
+        ("mtf emmetropia --white-light --frequency-cpd 70", "expected 0 to 60"),
+    ],
+)
+def test_refusals_name_the_option_and_what_is_allowed(words, said):
+    ended = run_command(*words.split())
+    assert ended.returncode == 2
+    assert ended.stderr.count("\n") == 1
+    assert said in ended.stderr
+
+
+@pytest.mark.parametrize(
+    ("text", "values"),
+    [
+        ("3", [3.0]),
+        ("3, 4 5", [3.0, 4.0, 5.0]),
+        ("0:1:0.25", [0.0, 0.25, 0.5, 0.75, 1.0]),
+        ("2:-2:-2,7", [2.0, 0.0, -2.0, 7.0]),
+        ("0:0.3:0.1", [0.0, 0.1, 0.2, 0.3]),
+    ],
+)
+def test_a_list_is_numbers_or_a_range(text, values):
+    assert listed_numbers("--x-dpt", text, (-10.0, 10.0)) == values
+
+
+@pytest.mark.parametrize("text", ["", "0:1:0", "1:0:1", "0:1e9:1e-9", "nan", "1:2:3:4"])
+def test_other_lists_are_refused(text):
+    with pytest.raises(ValueError, match="--x-dpt is"):
+        listed_numbers("--x-dpt", text, (-10.0, 10.0))
