@@ -171,7 +171,8 @@ def field(
     plot: Annotated[
         Path | None,
         typer.Option(
-            metavar="OUT.png", help="Plot maps of M, astigmatism, coma and blur."
+            metavar="OUT.png",
+            help="Plot maps of M, astigmatism, coma and blur, and PSFs over the field.",
         ),
     ] = None,
     people: Annotated[
@@ -253,7 +254,7 @@ def field(
         drawn = _drawn(eye, people, states, quiet=json_output)
         notes.append(f"{people} persons: {drawn_text(eye)}")
     if plot is not None:
-        from estimator.field.field_table import plot_field
+        from estimator.field.field_figure import plot_field
 
         title = f"{eye.name}, {pupil_mm:g} mm"
         write = partial(plot_field, found, title=title, drawn=drawn)

@@ -11,7 +11,8 @@ prepare                 entry point: from a profile to such an eye, with notes
 network_eye             entry point of the published pipeline, whose eyes are estimated
                         by networks
 field_table             wavefronts at the cornea in many directions, also of randomly
-                        sampled people, and their maps
+                        sampled people
+field_figure            their maps and PSFs
 
 A *field* is a direction in the visual field, azimuth h and elevation v.  A *grid* has
 axes of h, v, pupil, accommodation and wavelength.  The *state* of an eye is its pupil

@@ -7,15 +7,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
+
+from estimator.psf.drawing import draw_psf
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 MAX_LINES, MAX_IMAGES = 24, 64
 IMAGE_AXES = ("y_arcmin", "x_arcmin")
-IMAGE_DECADES = 4.0
-"""Powers of ten between white and black in images of PSFs."""
 
 TEXTS = {
     "modulation_ratio": "modulation",
@@ -110,22 +109,6 @@ def _images(array: Any) -> Figure:
         )
     figure.supxlabel("arcmin", fontsize="small")
     return figure
-
-
-def draw_psf(axes: Axes, kernel: NDArray[Any], *, half_side_arcmin: float) -> None:
-    """Draw a PSF [y, x], logarithmic: its peak white, `IMAGE_DECADES` below it black.
-
-    Parameters
-    ----------
-    half_side_arcmin : float
-        From its center to its edge.
-    """
-    extent = (-half_side_arcmin, half_side_arcmin) * 2
-    decades = np.log10(np.maximum(kernel / kernel.max(), 10.0**-IMAGE_DECADES))
-    axes.imshow(
-        decades, cmap="gray", vmin=-IMAGE_DECADES, vmax=0.0, extent=extent,
-        interpolation="nearest",
-    )  # fmt: skip
 
 
 def _label(array: Any, index: dict[str, int]) -> str:

@@ -5,6 +5,7 @@ arguments          argument checks
 compiled           the engine in C
 discs              its PSFs over discs of given radii
 kernel_types       result type, kernel buffer, kernel disc
+drawing            PSFs on the axes of a figure
 pupil              pupils in pixel coordinates
 survey             wavefront slopes and kernel radii, before any PSF is computed
 switch             choice of wave or ray optics, by predicted error

@@ -95,7 +95,7 @@ EYE_ROOMS = {
     "estimate": ("networks", "profiles", "eye", "wavefront", "optics"),
     "field": (
         *("native", "estimate", "networks", "periphery", "profiles"),
-        *("eye", "corrections", "wavefront", "optics"),
+        *("eye", "corrections", "wavefront", "optics", "psf"),
     ),
     "image_quality": (
         *("field", "estimate", "profiles", "acuity", "media", "corrections", "psf"),
@@ -181,7 +181,8 @@ HOME = {
         "clients/*",
         "tests/*",  # plots of measurements
         "estimator/estimate/plot.py",  # `ocufilter estimate --plot`
-        "estimator/field/field_table.py",  # `ocufilter field --plot`
+        "estimator/field/field_figure.py",  # `ocufilter field --plot`
+        "estimator/psf/drawing.py",  # and PSFs in figures
         "estimator/image_quality/*.py",  # `LabeledArray.plot`
         "training/learning_curve.py",
     ),

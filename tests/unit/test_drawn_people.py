@@ -6,12 +6,8 @@ import numpy as np
 import pytest
 
 from estimator import drawn_profiles, load_profile, parse_profile
-from estimator.field.field_table import (
-    DrawnFields,
-    drawn_fields,
-    field_figure,
-    field_table,
-)
+from estimator.field.field_figure import field_figure
+from estimator.field.field_table import DrawnFields, drawn_fields, field_table
 from tests.commands import run_command
 
 MYOPE = {"kind": "prescription", "sphere_dpt": -2.0, "age_years": 30}
@@ -209,3 +205,25 @@ def test_maps_have_lines_of_half_the_band():
 def test_a_preset_is_measured_on_its_axis():
     drawn = drawn_fields(load_profile("keratoconus"), 2, **STATES)
     assert drawn.coma_um[0, 1] == pytest.approx(drawn.coma_um[1, 1], abs=1e-6)
+
+
+@pytest.mark.long("draws 18 PSFs")
+def test_psfs_over_the_field_are_at_one_scale():
+    """Nine columns of 11 x 2 directions, the upper row first."""
+    h_deg, v_deg = np.meshgrid(np.arange(-25.0, 26.0, 5.0), [-10.0, 10.0])
+    table = field_table(
+        load_profile("keratoconus"),
+        **STATES | {"h_deg": h_deg.ravel(), "v_deg": v_deg.ravel()},
+    )
+    figure = field_figure(table, title="eye")
+    shown = [axes for axes in figure.axes if axes.images]
+    assert len(shown) == 18
+    assert shown[0].get_title() == "-25, 10"
+    assert shown[-1].get_title() == "25, -10"
+    assert len({tuple(axes.images[0].get_extent()) for axes in shown}) == 1
+    kernel, side = shown[4].images[0].get_array(), shown[4].images[0].get_extent()[1]
+    x = np.arange(-40, 41) * side / 40.5
+    light = 10.0**kernel
+    spread = np.sqrt((light * (x**2 + x[:, None] ** 2)).sum() / light.sum())
+    blur = np.hypot(*[table.power_dpt[16, k] for k in (0, 1)]) * 2.0 / np.sqrt(2.0)
+    assert spread == pytest.approx(blur * 3.44, rel=0.35)  # mrad to arcmin
