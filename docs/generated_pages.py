@@ -29,10 +29,12 @@ from filter_service.validation import allowed_values
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = {
+    "estimator": "Estimate an eye; compute its PSFs, MTF and acuity",
     "filter_service": "Filter frames in your own process",
     "clients": "Connect to a service",
-    "estimator": "Estimate an eye; compute its wavefronts and PSFs",
 }
+FIRST = {"estimator": ("Eye", "LabeledArray")}
+"""Names that precede the others of their package."""
 RESULTS = "tests/benchmarks/results"
 
 
@@ -69,7 +71,9 @@ def _api_page() -> str:
     for package, purpose in PACKAGES.items():
         lines += [f"## {purpose}", ""]
         module = importlib.import_module(package)
-        for name in sorted(module.__all__, key=str.lower):
+        first = FIRST.get(package, ())
+        names = sorted(set(module.__all__) - set(first), key=str.lower)
+        for name in (*first, *names):
             found = getattr(module, name)
             if inspect.ismodule(found):  # a section of its own
                 continue

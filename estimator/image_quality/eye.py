@@ -77,20 +77,15 @@ class Eye:
     ``h_deg=("direction", [0, 20]), v_deg=("direction", [0, 5])``.  The axes of the
     states, in the order below, precede those of the method.
 
-    ================== ======= ====================================================
-    argument           default meaning
-    ================== ======= ====================================================
-    h_deg, v_deg       0       direction of the source, to the person's right and up
-    pupil_diameter_mm  4       entrance pupil at 555 nm, 0.5 to 12
-    focus_dpt          None    distance that the eye focuses, as well as it can.  By
-                               default, it is relaxed in `wavefront` and `refraction`,
-                               and focused at infinity in the other methods, as in the
-                               commands; an eye that is given by its surfaces is
-                               relaxed
-    object_dpt         0       distance of the source, from the entrance pupil; 0 is
-                               infinity, negative values are virtual objects
-    wavelength_nm      555     380 to 780
-    ================== ======= ====================================================
+    - ``h_deg``, ``v_deg``: direction of the source, to the person's right and up; the
+      axis by default.
+    - ``pupil_diameter_mm``: entrance pupil at 555 nm, 0.5 to 12; 4 by default.
+    - ``focus_dpt``: distance that the eye focuses, as well as it can.  By default, it
+      is relaxed in `wavefront` and `refraction`, and focused at infinity in the other
+      methods, as in the commands; an eye given by its surfaces is relaxed.
+    - ``object_dpt``: distance of the source from the entrance pupil; infinity by
+      default, negative for virtual objects.
+    - ``wavelength_nm``: 380 to 780; 555 by default.
 
     A state takes about 20 ms to trace and is kept, so that other methods and object
     distances reuse it.

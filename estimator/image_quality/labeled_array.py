@@ -244,7 +244,7 @@ class LabeledArray:
         Parameters
         ----------
         x : str, optional
-            Axis of the abscissa; by default the last one of more than one number.
+            Axis of the abscissa; by default the longest one.
 
         Raises
         ------

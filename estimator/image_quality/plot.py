@@ -51,7 +51,7 @@ def figure_of(array: Any, *, quantity_axis: str, x: str | None = None) -> Figure
         return _images(array)
     long = [d for d in array.dims if array.sizes[d] > 1 and d != quantity_axis]
     if x is None and long:
-        x = long[-1]
+        x = max(long[::-1], key=array.sizes.__getitem__)
     if x is None or x not in long:
         raise ValueError(
             f"x {x!r}: expected an axis of more than one number: "
@@ -116,6 +116,8 @@ def _label(array: Any, index: dict[str, int]) -> str:
     texts = []
     for dim, position in index.items():
         names = [n for n in array.coords if array.dims_of(n) == (dim,)]
+        if not names:
+            texts.append(f"{dim} {position}")
         for name in names:
             value = array.coords[name][position].item()
             text = f"{value:g}" if isinstance(value, float) else str(value)

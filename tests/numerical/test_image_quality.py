@@ -9,7 +9,6 @@ from estimator import (
     LabeledArray,
     field_table,
     load_profile,
-    nm_from_index,
     parse_profile,
     perfect_transfer,
     prepare_eye,
@@ -21,6 +20,7 @@ from estimator.acuity.transfer import (
     neural_sensitivity,
 )
 from estimator.media import Straylight
+from tests.benchmarks.bench_eye import isetbio_psf
 from tests.benchmarks.peer_isetbio import moved_light, published_psfs
 from tests.human_data import published_log_mar
 from tests.reference import pupil_sums
@@ -342,43 +342,12 @@ def test_psfs_are_those_of_isetbio(number):
     too few: an exact sum is as far from them (`test_peer_scripts`).
     """
     published = published_psfs()[number]
-    eye = Eye(
-        {
-            "kind": "zernike",
-            "eye_side": "OD",
-            "pupil_diameter_mm": 6.0,
-            "wavelength_nm": 550.0,
-            "zernike_um": {
-                "{},{}".format(*nm_from_index(j)): float(value)
-                for j, value in enumerate(published.zernike_um, 1)
-                if j > 2 and value
-            },
-        }
-    )
-    state = {
-        "pupil_diameter_mm": published.pupil_diameter_mm,
-        "wavelength_nm": 550.0,
-        "focus_dpt": -20.0,  # relaxed
-    }
-    kernel = eye.psf(
-        pixel_arcmin=published.sample_arcmin / 3.0,
-        radius_arcmin=100.0 * published.sample_arcmin,
-        **state,
-    )
-    # Their image is not centered on the chief ray: move ours by the tilt that differs.
-    pupil = pupil_of(eye, **state)
-    theirs = pupil_sums.rescaled_tilt_um(
-        published.zernike_um, radius_ratio=published.pupil_diameter_mm / 6.0
-    )
-    y_um, x_um = theirs - pupil.zernike_um[1:3]
-    step = published.sample_arcmin * pupil_sums.MRAD_PER_ARCMIN / 3.0
-    found = pupil_sums.moved(
-        kernel.values,
-        x_px=2.0 * x_um / pupil.radius_mm / step,
-        y_px=-2.0 * y_um / pupil.radius_mm / step,
-    )[::3, ::3]
+    found, eye, state, _ = isetbio_psf(published)
     most = 0.065 if "+2 dpt" in published.label else 0.03
-    assert moved_light(found / found.sum(), published.psf) <= most
+    assert moved_light(found, published.psf) <= most
+    kernel = eye.psf(pixel_arcmin=0.5, radius_arcmin=15.0, **state).values
+    exact = pupil_sums.psf(pupil_of(eye, **state), pixel_arcmin=0.5, radius_px=30)
+    assert np.abs(kernel / kernel.sum() - exact).sum() / 2.0 <= 0.005
 
 
 @pytest.mark.long("transfer functions of three pupils")
