@@ -42,7 +42,7 @@ MAX_SAMPLE = 999_999
 
 
 @dataclass(frozen=True, kw_only=True)
-class EyeOptions:
+class ImageSetOptions:
     """Options of commands that filter sets of images through several eyes."""
 
     out: Annotated[
@@ -108,7 +108,7 @@ class EyeOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
-class BatchOptions(EyeOptions):
+class BatchOptions(ImageSetOptions):
     """Options of `ocufilter batch`."""
 
     source: Annotated[
@@ -250,7 +250,7 @@ def batch_of(options: BatchOptions) -> Batch:
     return Batch(job, layout, options.source, frames, options.out)
 
 
-def workers_and_threads(options: EyeOptions) -> tuple[int, int]:
+def workers_and_threads(options: ImageSetOptions) -> tuple[int, int]:
     """Return the number of processes, and of threads in each.
 
     One process per core filters more frames than one process with as many threads
@@ -262,13 +262,13 @@ def workers_and_threads(options: EyeOptions) -> tuple[int, int]:
     return n_workers, options.threads or max(1, n_cores // n_workers)
 
 
-def check_options(options: EyeOptions, **limits: tuple[float, float]) -> None:
+def check_options(options: ImageSetOptions, **limits: tuple[float, float]) -> None:
     """Check the numbers of options, and that the output is not a file.
 
     Parameters
     ----------
     **limits
-        Limits of options besides those of `EyeOptions`.
+        Limits of options besides those of `ImageSetOptions`.
 
     Raises
     ------
@@ -319,7 +319,9 @@ def _listed(path: Path, states: States, names: Sequence[str]) -> States:
     return states
 
 
-def profiles_of(options: EyeOptions, texts: Sequence[str]) -> dict[str, dict[str, Any]]:
+def profiles_of(
+    options: ImageSetOptions, texts: Sequence[str]
+) -> dict[str, dict[str, Any]]:
     """Return profiles by the names of their folders, with drawn persons if asked for.
 
     Raises

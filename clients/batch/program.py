@@ -13,7 +13,7 @@ import typer
 from clients.batch.manifest import Manifest, note_line
 from clients.batch.options import (
     BatchOptions,
-    EyeOptions,
+    ImageSetOptions,
     batch_of,
     workers_and_threads,
 )
@@ -122,7 +122,7 @@ def _pool(
     )
 
 
-def report_lines(summary: dict[str, Any], options: EyeOptions) -> list[str]:
+def report_lines(summary: dict[str, Any], options: ImageSetOptions) -> list[str]:
     """Format the summary as lines of text."""
     this_run = summary["this_run"]
     n_all, n_failed = summary["frames"], len(summary["failures"])

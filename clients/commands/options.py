@@ -11,7 +11,7 @@ from __future__ import annotations
 import functools
 import inspect
 from collections.abc import Callable, Mapping
-from dataclasses import MISSING, fields
+from dataclasses import MISSING, Field, fields
 from pathlib import Path
 from typing import Annotated, Any, NoReturn, cast, get_args, get_type_hints
 
@@ -44,10 +44,16 @@ def with_options(command: Callable[..., None]) -> Callable[..., None]:
     """Give a command an option for each field of its argument, a dataclass.
 
     Annotate fields like parameters of a command.  Commands that share options derive
-    their dataclasses from a common base.  Required options are listed first.
+    their dataclasses from a common base.  Required options are listed first, and those
+    of the base last.
     """
     record = get_type_hints(command)["options"]
     hints = get_type_hints(record, include_extras=True)
+    own = inspect.get_annotations(record)
+
+    def place(field: Field[Any]) -> tuple[bool, bool]:
+        return field.default is not MISSING, field.name not in own
+
     options = [
         inspect.Parameter(
             field.name,
@@ -57,7 +63,7 @@ def with_options(command: Callable[..., None]) -> Callable[..., None]:
             else field.default,
             annotation=hints[field.name],
         )
-        for field in sorted(fields(record), key=lambda one: one.default is not MISSING)
+        for field in sorted(fields(record), key=place)
     ]
     return _expanded(command, "options", options, lambda given: record(**given))
 
@@ -248,7 +254,7 @@ def read_numbers(
             value = float(part)
         except ValueError:
             raise ValueError(
-                f"{option} is '{text:.60}'{likely_number(part)}, or several as in 3,5"
+                f"{option} is '{text:.60}'{likely_number(part)}"
                 + (f", or {other}" if other else "")
             ) from None
         check_range(option, value, limits)

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from clients.batch.options import EyeOptions, check_options
+from clients.batch.options import ImageSetOptions, check_options
 from clients.batch.source import CENTER
 from clients.batch.views import Views
 from clients.commands.options import read_numbers, read_size_px
@@ -26,7 +26,7 @@ def _numbers(metavar: str, text: str) -> typer.models.OptionInfo:
 
 
 @dataclass(frozen=True, kw_only=True)
-class StimuliOptions(EyeOptions):
+class StimuliOptions(ImageSetOptions):
     """Options of `ocufilter stimuli`."""
 
     letters: Annotated[

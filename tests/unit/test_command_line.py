@@ -175,7 +175,7 @@ def test_an_option_that_turns_a_setting_off_has_its_own_help():
     assert "--gaze-v-deg <float> Gaze above the image's axis, deg." in shown
 
 
-@pytest.mark.parametrize("focus", ["2,5", "2.5dpt"])
+@pytest.mark.parametrize("focus", ["2.5dpt", "1,2.5dpt"])
 def test_a_focus_of_a_batch_is_a_number_or_the_center(tmp_path, capsys, focus):
     from PIL import Image
 
