@@ -36,7 +36,7 @@ ENDLESS = ("serve", "web", "layer serve", "layer run", "headset --left")
 
 SLOW = (
     *("doctor", "report", "batch", "latency", "headset --simulated"),
-    r"field .* --people",
+    *(r"field .* --people", r"stimuli .* -p "),
 )
 """Commands, as patterns, that take seconds."""
 
