@@ -7,6 +7,7 @@ import pytest
 
 from filter_service import (
     BadMessage,
+    Camera,
     DepthProjection,
     EyeFilter,
     GlTexture,
@@ -196,3 +197,29 @@ def test_frames_begun_early_are_those_of_filter(scene, where):
         stored = len(eye.prepared_stores)
         eye.filter([views[0]], **states[0])  # frees what is no longer used
         assert len(eye.prepared_stores) == stored == 1
+
+
+@pytest.mark.long("an eye is built, with wide kernels")
+@pytest.mark.parametrize(
+    ("distance_m", "is_limited"),
+    [(4.0, False), pytest.param(0.11, True, marks=pytest.mark.slow)],
+)
+def test_a_frame_reports_the_largest_kernel_only_if_it_exceeds_it(
+    distance_m, is_limited
+):
+    """With pixels of 0.2 arcmin, the prepared range to 10 dpt does, too."""
+    camera = Camera.from_intrinsics(
+        *(17200.0, 17200.0, WIDTH / 2, HEIGHT / 2), width_px=WIDTH, height_px=HEIGHT
+    )
+    color = np.full((HEIGHT, WIDTH, 3), 128, np.uint8)
+    depth_m = np.full((HEIGHT, WIDTH), distance_m, np.float32)
+    plain = RgbdView(color, depth_m, camera.tangents)
+    profile = {"kind": "prescription", "sphere_dpt": 0.0}
+    state = {"pupil_diameter_mm": 5.0, "focus_dpt": 0.25}
+    with callers_context():
+        textures = Textures()
+        view, target = texture_view(textures, plain), textures.new("rgba8", SIZE_PX)
+        with EyeFilter(profile, camera, SETTINGS, gl_context="current") as eye:
+            found = [frame_of(eye, view, target, **state), eye.filter(plain, **state)]
+    for frame in found:
+        assert ("blur_limited" in [note.code for note in frame.notes]) == is_limited
