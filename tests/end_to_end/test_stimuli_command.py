@@ -28,6 +28,7 @@ def listing(out):
     return json.loads((out / "stimuli.json").read_text())
 
 
+@pytest.mark.long("fifteen stimuli are drawn")
 def test_pictures_and_their_listing(tmp_path):
     out = tmp_path / "out"
     told = run(
@@ -63,6 +64,7 @@ def test_pictures_and_their_listing(tmp_path):
     )
 
 
+@pytest.mark.long("four commands")
 def test_a_folder_of_other_stimuli_is_kept_unless_told(tmp_path):
     out = tmp_path / "out"
     first = ("--letters", "C", "--height-arcmin", "8", *SMALL, "-o", out)
@@ -75,6 +77,7 @@ def test_a_folder_of_other_stimuli_is_kept_unless_told(tmp_path):
     assert path.name == "sloan_D_8arcmin.png"
 
 
+@pytest.mark.clients
 @pytest.mark.long("eyes of two persons are prepared by a worker")
 def test_people_pupils_and_foci_see_what_the_filter_shows(tmp_path):
     out = tmp_path / "out"
@@ -106,6 +109,7 @@ def test_people_pupils_and_foci_see_what_the_filter_shows(tmp_path):
     assert "4 of 4 images, 0 of them in this run" in run(*arguments)
 
 
+@pytest.mark.clients
 @pytest.mark.long("an eye is prepared by a worker")
 def test_a_screen_has_other_pixels_at_each_distance(tmp_path):
     out = tmp_path / "out"

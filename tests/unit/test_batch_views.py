@@ -127,11 +127,30 @@ def test_a_folder_without_depth_has_the_distance_that_is_given(photographs):
     assert "Infinity" not in json.dumps(frames[0].described())
 
 
+def test_a_video_needs_no_depth_if_its_distance_is_given(tmp_path, rng):
+    av = pytest.importorskip("av")
+    path = tmp_path / "walk.mkv"
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("ffv1", rate=25)
+        stream.width, stream.height, stream.pix_fmt = 32, 24, "bgr0"
+        for _ in range(2):
+            color = rng.integers(0, 256, (24, 32, 3), dtype=np.uint8)
+            image = av.VideoFrame.from_ndarray(color, format="rgb24")
+            container.mux(stream.encode(image))
+        container.mux(stream.encode(None))
+    layout, frames = list_frames(path, "auto", optics=OPTICS, constant=Constant(0.5))
+    assert (layout, len(frames)) == ("video", 2)
+    assert [(frame.depth, frame.videos) for frame in frames] == [(None, (path,))] * 2
+    with pytest.raises(ValueError, match=r"--depth is not given; .*or --distance-m"):
+        list_frames(path, "auto", optics=OPTICS)
+
+
 def test_depth_and_a_distance_are_not_both_taken(photographs):
     with pytest.raises(ValueError, match="--distance-m and --depth-scale are given"):
         list_frames(photographs, "auto", None, OPTICS, 0.001, Constant(0.5))
 
 
+@pytest.mark.clients
 @pytest.mark.long("eyes of two persons are prepared by a worker")
 def test_one_command_filters_photographs_through_people_and_pupils(
     photographs, tmp_path
