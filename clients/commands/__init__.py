@@ -5,6 +5,7 @@ options        options that commands share: settings, profiles, sizes
 service        status, latency, keys and eyes: a running service and its folders
 filter_image   filter: one image
 correct_image  correct: a picture solved for a viewer
+best_lens      best-lens: spectacles or a contact lens for a scene
 eye            estimate and field: an eye and its visual field
 optics         wavefront and psf: an eye in one direction
 coefficients   coefficients in other orders, as wavefront and estimate print them

@@ -219,7 +219,7 @@ def correct_image(
         (seen_after, found.after),
     ):
         if path is not None:
-            _write(path, image, grid)
+            write_linear(path, image, grid)
     summary = _summary(found, out, [*notes, *found.notes])
     if json_output:
         print_json(summary)
@@ -227,7 +227,7 @@ def correct_image(
         _report(summary)
 
 
-def _write(path: Path, linear: "NDArray[Any]", grid: "PixelGrid") -> None:
+def write_linear(path: Path, linear: "NDArray[Any]", grid: "PixelGrid") -> None:
     """Write linear light, as 8-bit sRGB to a PNG file."""
     from filter_service.atomic_files import replace_atomically
     from filter_service.color_encoding import srgb8_of

@@ -45,6 +45,10 @@ COMMANDS = {
         "clients.commands.correct_image:correct_image",
         "Solve for the picture that a viewer sees as it was meant.",
     ),
+    "best-lens": (
+        "clients.commands.best_lens:find_best_lens",
+        "Find the spectacles or contact lens that are best for a scene.",
+    ),
     "batch": (
         "clients.batch.program:batch",
         "Filter folders and videos of color and depth, on all cores.",
