@@ -111,7 +111,7 @@ def find_best_lens(
         ),
     ] = "luminance",
     max_lenses: Annotated[
-        int, typer.Option(min=20, max=1000, help="Most lenses to try.")
+        int, typer.Option(min=30, max=1000, help="Most lenses to try.")
     ] = 120,
     seen_before: Annotated[
         Path | None,

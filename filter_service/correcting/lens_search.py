@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -43,6 +44,7 @@ from filter_service.correcting.solver import check_number
 from filter_service.errors import BadMessage
 from filter_service.filtering.builder import Builder
 from filter_service.filtering.eye_filter import EyeFilter
+from filter_service.filtering.shared_builder import open_inline_builder
 from filter_service.filtering.stream_eyes import Profile, as_profile
 from filter_service.settings import DEFAULTS, FilterSettings, as_settings
 from filter_service.waiting import Wait
@@ -56,7 +58,7 @@ POWER_STEP_DPT, AXIS_STEP_DEG = 0.25, 1.0
 RELAXING_ADD_DPT = 2.5
 """Near addition of a profile whose eye does not accommodate."""
 
-SCAN_DPT = (-1.0, -0.5, 0.0, 0.5, 1.0)
+SCAN_DPT, SCAN_STEP_DPT = 1.0, 0.5
 """Spheres added to the start: the measure may have several peaks."""
 
 FIRST_RADIUS_DPT, LAST_RADIUS_DPT = 0.5, 0.01
@@ -66,7 +68,7 @@ LEAST_ERROR = 1e-30
 BOUND_DPT = 20.0
 ADD_LIMITS_DPT = 0.25, 4.0
 FIRST_ADD_DPT = 2.0
-EVALUATION_LIMITS = 20, 1000
+EVALUATION_LIMITS = 30, 1000
 
 
 @dataclass(frozen=True)
@@ -185,12 +187,12 @@ def best_lens(
         alike; or of these, weighted by neural contrast sensitivity.
     has_cylinder : bool
         Whether the lens may have a cylinder.
-    max_evaluations : int, 20 to 1000
+    max_evaluations : int, 30 to 1000
         Most lenses to try.
     settings : FilterSettings or mapping, optional
         Its ranges of pupil, focus and distance are replaced by those of the scenes.
     builder : Builder, optional
-        As for `EyeFilter`.
+        As for `EyeFilter`; by default one for this search, in the calling thread.
     on_progress : callable, optional
         Called with the completed fraction, 0 to 1, and the stage; otherwise, a bar on
         stderr shows the progress, as for `EyeFilter`.
@@ -211,8 +213,8 @@ def best_lens(
     Notes
     -----
     The start is the correction with the highest visual Strehl ratio for the first
-    scene with the farthest focus.  Its sphere is scanned by ±1 dpt, and COBYQA, a
-    derivative-free trust-region method, continues from the best (Ragonneau and Zhang,
+    scene with the farthest focus.  Its sphere is scanned in steps of 0.5 dpt, and
+    COBYQA, a derivative-free trust-region method, continues from the best (Ragonneau and Zhang,
     2023, as implemented in SciPy).  The image magnification by spectacles and
     yellowing are not errors and are left out.
     """
@@ -227,18 +229,24 @@ def best_lens(
             field="profile.correction",
             allowed="spectacles, a contact lens or none",
         )
-    search = _Search(
-        eye=eye,
-        scenes=checked_scenes(scenes),
-        body=body,
-        target_eye=None if target_eye is None else _seen_plain(as_profile(target_eye)),
-        measure=measure,
-        has_cylinder=has_cylinder,
-        settings=as_settings(settings),
-        builder=builder,
-    )
+    targets_eye = None if target_eye is None else _seen_plain(as_profile(target_eye))
     begin_s = time.perf_counter()
-    with Wait("Searching the lens", is_shown=on_progress is None) as waiting:
+    with (
+        ExitStack() as closing,
+        Wait("Searching the lens", is_shown=on_progress is None) as waiting,
+    ):
+        search = _Search(
+            eye=eye,
+            scenes=checked_scenes(scenes),
+            body=body,
+            target_eye=targets_eye,
+            measure=measure,
+            has_cylinder=has_cylinder,
+            settings=as_settings(settings),
+            # A builder of its own builds in this thread: its worker would start anew
+            # for each lens.
+            builder=open_inline_builder(closing) if builder is None else builder,
+        )
 
         def report(stage: str) -> None:
             fraction = min(len(search.trials) / max_evaluations, 1.0)
@@ -262,7 +270,7 @@ class _Search:
         measure: LensMeasure,
         has_cylinder: bool,
         settings: FilterSettings,
-        builder: Builder | None,
+        builder: Builder,
     ) -> None:
         self.trials: list[LensTrial] = []
         self._eye, self._body, self._has_cylinder = eye, body, has_cylinder
@@ -303,7 +311,7 @@ class _Search:
         if self._is_progressive:
             x0 = np.append(x0, self._first_add_dpt())
         scanned = []
-        for sphere_dpt in sorted(SCAN_DPT, key=abs):
+        for sphere_dpt in sorted(self._scan_dpt(), key=abs):
             x = x0.copy()
             x[0] += sphere_dpt
             scanned.append((error_db(x), x))
@@ -381,11 +389,23 @@ class _Search:
         removed_um[SECOND_ORDER] = (seen.zernike_um[0] - best_um)[SECOND_ORDER]
         return power_vector_from_zernike(removed_um, zernike_radius_mm=radius_mm)
 
+    @property
+    def _span_dpt(self) -> float:
+        """Return the range of foci."""
+        return max(s.range_dpt[1] for s in self._sights) - self._farthest_dpt
+
+    def _scan_dpt(self) -> list[float]:
+        """Return spheres to add to the start, up to those for the nearest focus."""
+        last_dpt = SCAN_DPT
+        if not self._is_progressive:
+            last_dpt += min(self._span_dpt, ADD_LIMITS_DPT[1])
+        n_steps = math.ceil((last_dpt + SCAN_DPT) / SCAN_STEP_DPT)
+        return [k * SCAN_STEP_DPT - SCAN_DPT for k in range(n_steps + 1)]
+
     def _first_add_dpt(self) -> float:
         """Return the addition that the nearest focus requires without accommodation."""
-        nearest_dpt = max(sight.range_dpt[1] for sight in self._sights)
         low_dpt, high_dpt = ADD_LIMITS_DPT
-        return min(max(nearest_dpt - self._farthest_dpt, low_dpt), high_dpt)
+        return min(max(self._span_dpt, low_dpt), high_dpt)
 
     def _try(self, x: NDArray[np.float64]) -> LensTrial:
         """Return the error of a lens by its power vector at the pupil and addition."""

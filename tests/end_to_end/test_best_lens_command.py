@@ -80,7 +80,7 @@ def test_far_and_near_in_words(arguments):
         ("--distance-m 1 --weight 0", "--weight is 0; allowed: 1e-06 to 1e+06"),
         ("--distance-m 1 --pupil-mm 99", "--pupil-mm is 99; allowed: 0.5 to 9 mm"),
         ("--distance-m 1 --vertex-mm 99", "--vertex-mm is 99; allowed: 0 to 25 mm"),
-        ("--distance-m 1 --max-lenses 3", "--max-lenses is '3'; allowed: 20 or more"),
+        ("--distance-m 1 --max-lenses 3", "--max-lenses is '3'; allowed: 30 or more"),
         ("--distance-m 1 --lens iol", "--lens is 'iol'; allowed: spectacles,"),
         ("--distance-m 1 --seen-after a.gif", "'.gif' is not a kind of output"),
         ("--distance-m 1 --target-eye nobody", "nobody"),
