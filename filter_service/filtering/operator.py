@@ -18,7 +18,11 @@ from filter_service.camera import Camera
 from filter_service.constants import RGB
 from filter_service.errors import BadMessage, OutOfMemory, RenderFailed
 from filter_service.filtering.planned_frame import PlannedFrame, PlannedView
-from filter_service.rendering.engine import ViewRequest
+from filter_service.psfs.exact_store import LAYER_STEP_RATIO
+from filter_service.psfs.frame_layers import frame_layers
+from filter_service.psfs.frozen_store import FrozenLayers, FrozenStore
+from filter_service.rendering.engine import ViewRequest, clamped_gaze
+from filter_service.rendering.frame import fill_missing_depth, object_dpt
 from filter_service.rendering.frame_kernels import MissingPsfs
 from filter_service.rendering.media_effects import (
     MediaEffects,
@@ -264,6 +268,49 @@ def _planned_operator(planned: PlannedView, options: RenderOptions) -> ViewOpera
         found = ViewOperator.of(request, planned.eye.media_effects)
         planned.builder.mark_rendered(planned.stream, planned.eye, planned.store)
     return found
+
+
+def frozen_layers(planned: PlannedView) -> FrozenLayers:
+    """Return layers at the distances of a planned view, for `frozen_operator`."""
+    store, view = planned.store.store, planned.view
+    assert isinstance(view, RgbdView)
+    distances_dpt = [
+        object_dpt(view, fill_missing_depth(depth_m)[0]).ravel()
+        for depth_m in view.surface_depths_m
+    ]
+    layers = frame_layers(
+        store, planned.state, step_ratio=LAYER_STEP_RATIO[store.spec.settings.mode]
+    )
+    vergence_dpt = store.eye.vergence.vergence_dpt(np.concatenate(distances_dpt))
+    return FrozenLayers.of(layers, np.clip(vergence_dpt, *layers.vergence_range_dpt))
+
+
+def frozen_operator(
+    planned: PlannedFrame, frozen: Sequence[FrozenLayers], *, is_sequence: bool
+) -> FilterOperator:
+    """Return the operator of a planned frame whose views have frozen layers.
+
+    Raises
+    ------
+    BadMessage
+        If the PSFs of the eye or of the settings cannot be computed by quadrature.
+    """
+    views = []
+    for view, layers in zip(planned.views, frozen, strict=True):
+        store = view.store.store
+        if store.eye.rings is not None or not store.spec.settings.diffraction:
+            raise BadMessage(
+                "'fine'",
+                field="accuracy",
+                allowed="'normal' without diffraction or with a multifocal lens",
+            )
+        gaze_deg, _ = clamped_gaze(store.spec, view.state.gaze_deg)
+        state = replace(view.state, gaze_deg=gaze_deg)
+        camera = view.view.camera
+        size_px = camera.width_px, camera.height_px
+        own = NativeStore(FrozenStore(store, state, layers, size_px))
+        views.append(_planned_operator(replace(view, store=own), operator_options(0.0)))
+    return FilterOperator(views, is_sequence=is_sequence)
 
 
 def views_of_depth(

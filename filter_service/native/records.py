@@ -93,7 +93,7 @@ class Frame(c.Structure):
         ("blend_across", POINTER),
         ("blend_down", POINTER),
         ("block_slots", c.c_int32),
-        ("spare", c.c_int32),
+        ("has_fine_kernels", c.c_int32),
         ("row_scratch", POINTER),
         ("dpt", POINTER),
         ("position", POINTER),

@@ -63,6 +63,8 @@ class ExactStore(PsfStore):
         Object distances of the frame.
     field_step_ratio : float
         Factor of the largest distance between field nodes, to save memory.
+    layer_dpt : (n_layers,), optional
+        Layers of all states, ascending; by default those that suit the state.
 
     Attributes
     ----------
@@ -79,6 +81,7 @@ class ExactStore(PsfStore):
         object_range_dpt: tuple[float, float],
         *,
         field_step_ratio: float = 1.0,
+        layer_dpt: NDArray[np.float64] | None = None,
     ) -> None:
         settings = base.spec.settings
         is_fine = settings.tolerance == "fine"
@@ -110,12 +113,15 @@ class ExactStore(PsfStore):
             pupil_diameter_mm=pupil_mm, accommodation_dpt=accommodation_dpt
         )
         zero_dpt = at_infinity_dpt - self.defocus.change_at_nodes_dpt(change)
-        layer_dpt = _covering(
-            layers.layer_dpt, np.add(layers.vergence_range_dpt, change.range_dpt)
-        )
-        used_dpt = base.eye.vergence.vergence_dpt(np.array(object_range_dpt))
-        first, last = np.searchsorted(layer_dpt, used_dpt + change.range_dpt)
-        used_layer_dpt = layer_dpt[max(first - 1, 0) : last + 2]
+        if layer_dpt is not None:
+            used_layer_dpt = layer_dpt
+        else:
+            layer_dpt = _covering(
+                layers.layer_dpt, np.add(layers.vergence_range_dpt, change.range_dpt)
+            )
+            used_dpt = base.eye.vergence.vergence_dpt(np.array(object_range_dpt))
+            first, last = np.searchsorted(layer_dpt, used_dpt + change.range_dpt)
+            used_layer_dpt = layer_dpt[max(first - 1, 0) : last + 2]
         nodes = self._nodes(pupil_mm, accommodation_dpt, zero_dpt, used_layer_dpt)
         self._add_nodes([(0, 0)], nodes)
         reads = StateReads(np.zeros(1, np.int64), np.ones(1), np.ones(1))

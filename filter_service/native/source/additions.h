@@ -22,6 +22,10 @@ static void set_factors(void *argument, int row, int thread) {
              ++one) {
             int near = (int)((float)(65535 - (int)one->fraction) * near_per_step + 0.5f);
             int far = (int)((float)(int)one->fraction * per_step + 0.5f);
+            if (f->has_fine_kernels) {
+                near = (int)STEPS_15_BITS;
+                far = 1;
+            }
             one->fraction = (uint32_t)near | (uint32_t)far << 16;
         }
     }

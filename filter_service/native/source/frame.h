@@ -32,7 +32,8 @@ typedef struct {
 
 /* A kernel for fragments of one level: texels of four pairs (red, green, blue, mean) of
  * 15-bit weights at the near and far end.  weight = scale * (near * (1 - f) + far * f),
- * with the fraction f of the interval. */
+ * with the fraction f of the interval.  Fine kernels hold the near end alone: its high and low
+ * 15 bits take the places of both ends. */
 typedef struct {
     uint32_t first_texel;     /* of row 0; ROW_GAP_TEXELS zeros lie before and after a row */
     int32_t resolution;
@@ -144,7 +145,7 @@ typedef struct {
     const int32_t *blend_column, *blend_row;
     const float *blend_across, *blend_down;
     int32_t block_slots;      /* fragments that a block has room for */
-    int32_t spare;
+    int32_t has_fine_kernels; /* one distance in each interval, in 30 bits */
     float *row_scratch;                      /* cell_columns + 1 for each thread */
 
     float *dpt;               /* of each pixel; NOTHING_DPT in empty hidden pixels */

@@ -140,6 +140,27 @@ static void write_level(const frame *f, level_image *image, int own, kernel_end 
     }
 }
 
+/* Writes the near end of a kernel in 30 bits, rounded: derivatives are differences of kernels
+ * that differ by little. */
+static void write_fine_level(const frame *f, level_image *image, int own,
+                             const kernel_end *end) {
+    float most = larger_float(end->largest[own], 1e-30f);
+    float per_light = STEPS_15_BITS * STEPS_15_BITS / most;
+    int base = (int)STEPS_15_BITS;
+    image->scale = 1.0f / per_light;
+    image->near_ratio = image->far_ratio = STEPS_15_BITS;
+    uint32_t *row = f->kernel_texels + 4 * (size_t)image->first_texel;
+    memset(row - 4 * ROW_GAP_TEXELS, 0, 16 * ROW_GAP_TEXELS);
+    for (int y = 0; y < image->height; ++y, row += 4 * row_texels(image)) {
+        end_row from = row_of_end(end, own, y, image);
+        memset(row, 0, 16 * (size_t)row_texels(image));
+        for (int i = 4 * from.first; i < 4 * smaller_int(from.end, image->width); ++i) {
+            int steps = smaller_int((int)(from.texels[i] * per_light + 0.5f), base * base);
+            row[i] = (uint32_t)(steps / base) | (uint32_t)(steps % base) << 16;
+        }
+    }
+}
+
 #define KERNELS_AN_ITEM 8
 
 /* Blends some kernels in one resolution, cell by cell: the far end of one kernel is mostly
@@ -160,7 +181,9 @@ static void blend_some(const frame *f, int first, int last, int r, kernel_end *t
             if (resolution_of(f, shape, level) != r) continue;
             make_levels(ends[0], level - r);
             make_levels(ends[1], level - r);
-            write_level(f, f->kernels[k].level + level, level - r, ends);
+            level_image *image = f->kernels[k].level + level;
+            if (f->has_fine_kernels) write_fine_level(f, image, level - r, ends[0]);
+            else write_level(f, image, level - r, ends);
         }
     }
 }

@@ -34,6 +34,7 @@ from filter_service.native.records import (
     ShrinkJob,
 )
 from filter_service.psfs.frame_layers import FrameLayers
+from filter_service.psfs.frozen_store import FrozenStore
 from filter_service.psfs.pack import StoreTables, box_sizes, pack_reach, unpack_reach
 from filter_service.psfs.store import PsfStore
 from filter_service.rendering.frame import Merging
@@ -242,6 +243,8 @@ def plan_kernels(
     )
     if isinstance(kernels, MissingPsfs):
         return kernels
+    if isinstance(handle.store, FrozenStore):
+        handle.store.add_low_words(kernels.nodes.recipes)
     shapes = np.empty(kernels.count, KERNEL_SHAPE)
     n_texels = loops().call(
         "fill_shapes",
@@ -573,6 +576,7 @@ class FrameRecord:
 
     def set_store(self, handle: NativeStore) -> None:
         """Set pointers to the cached kernels."""
+        self.c.has_fine_kernels = handle.store.has_fine_kernels
         for r, stored in enumerate(handle.resolutions):
             self.c.store[r] = self._pointer_to(stored.words)
             self.c.store_first[r] = self._pointer_to(stored.first_texel)
