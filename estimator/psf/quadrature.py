@@ -25,7 +25,7 @@ from estimator.psf.compute import compute_psf_batch, plan_psfs
 from estimator.psf.survey import PupilSurvey
 from estimator.threads import thread_count
 
-MARGIN_PX = 24
+MARGIN_PX = 16
 """Distance from the spot up to which pixels are integrated."""
 
 MAX_SPOT_PX = 80
@@ -45,6 +45,15 @@ def _gauss_legendre(count: int) -> tuple[NDArray[np.float64], NDArray[np.float64
 
     nodes, weights = roots_legendre(count)
     return nodes, weights
+
+
+def _node_count(bandwidth: float) -> int:
+    """Return the number of Gauss-Legendre nodes for exp(i f), |f'| <= B on [-1, 1].
+
+    The error falls faster than exponentially from B / 2 nodes on, after a transition of
+    a width that is proportional to the cube root of B.
+    """
+    return math.ceil(bandwidth / 2.0 + 2.0 * bandwidth ** (1.0 / 3.0)) + 6
 
 
 def _polynomial(
@@ -83,11 +92,14 @@ def spot_by_quadrature(
     shear = float(frames.shear_ratio[psf])
     root = math.sqrt(1.0 - shear**2)
     per_um = 2.0 * math.pi / (float(frames.wavelength_nm[psf]) / 1000.0)
-    farthest_px = float(survey.blur_radius_px[psf]) + math.sqrt(2.0) * (radius_px + 1)
-    bandwidth = per_um * float(half.max()) * (1.0 + abs(shear)) * farthest_px
-    count = math.ceil(bandwidth / 2.0 + 3.0 * bandwidth ** (1.0 / 3.0)) + 8
-    step = math.pi / math.ceil(1.15 * count)
-    turn = -math.pi / 2.0 + step * (np.arange(math.ceil(1.15 * count)) + 0.5)
+    # Bandwidths of a chord, and of points of the edge from chord to chord.
+    spot_px = float(survey.blur_radius_px[psf])
+    along = per_um * float(half[1]) * root * (spot_px + radius_px + 0.5)
+    farthest_px = spot_px + math.sqrt(2.0) * (radius_px + 0.5)
+    across = per_um * float(half.max()) * (1.0 + abs(shear)) * farthest_px
+    count, chord_count = _node_count(along), math.ceil(1.15 * _node_count(across))
+    step = math.pi / chord_count
+    turn = -math.pi / 2.0 + step * (np.arange(chord_count) + 0.5)
     node, weight = _gauss_legendre(count)
     # On a chord, x of the disc is constant, and with it the phase of a pixel's column.
     x = np.broadcast_to(np.sin(turn)[:, None], (turn.size, count))
@@ -102,7 +114,7 @@ def spot_by_quadrature(
     field = weights * amplitude * np.exp(1j * wave)
     pixels = np.arange(-radius_px, radius_px + 1)
     (at_x, weight_x), (at_y, weight_y) = (
-        _gauss_legendre(math.ceil(b / 2.0 + 2.0 * b ** (1.0 / 3.0) + 4.0))
+        _gauss_legendre(math.ceil(b / 2.0 + 1.2 * b ** (1.0 / 3.0) + 2.0))
         for b in per_um * half
     )
     down = per_um * half[1] * box_y

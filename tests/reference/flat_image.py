@@ -26,6 +26,9 @@ DEPTH_MM = 3.05
 ORDER = 10
 """Radial order of the wavefront in the entrance pupil."""
 
+FIT_ORDER = 6
+"""Radial order of the fit to moved wavefronts in the filter."""
+
 REFERENCE_NM = 555.0
 
 AMPLITUDE_DPT = 10.0
@@ -101,6 +104,9 @@ class FlatScene:
         Linear light of the scene in each channel.
     pitch_mrad : (x, y)
         Pixel of the camera on its axis.
+    fit_radius_mm : float, optional
+        Radius of a circle over which the wavefront in the entrance pupil is fitted up
+        to `FIT_ORDER`; by default, it is that of the rays.
     """
 
     cornea_um: NDArray[np.float64] = field(repr=False)
@@ -111,6 +117,7 @@ class FlatScene:
     light: NDArray[np.float64] = field(repr=False)
     pitch_mrad: tuple[float, float]
     wavelengths_nm: tuple[float, ...] = (REFERENCE_NM,)
+    fit_radius_mm: float | None = None
 
     def with_power(self, sphere_dpt: float) -> "FlatScene":
         """Return the scene with a sphere at the cornea added to the eye."""
@@ -134,7 +141,21 @@ class FlatScene:
         """
         x, y, weight = disc_nodes()
         radius_mm = self.pupil_diameter_mm / 2.0
-        at_x, at_y = radius_mm * x, radius_mm * y
+        if self.fit_radius_mm is None:
+            value = self._moved_um(radius_mm * x, radius_mm * y)
+        else:
+            whole = self._moved_um(self.fit_radius_mm * x, self.fit_radius_mm * y)
+            fitted = np.einsum("tij,ij,ij->t", zernike_values(), whole, weight)
+            terms = dict(zip(zernike_terms(), fitted.tolist(), strict=True))
+            terms = {t: um for t, um in terms.items() if t[0] <= FIT_ORDER}
+            polynomial_um = _in_mm(terms, self.fit_radius_mm)
+            value = polyval2d(radius_mm * x, radius_mm * y, polynomial_um)
+        return np.einsum("tij,ij,ij->t", zernike_values(), value, weight)
+
+    def _moved_um(
+        self, at_x: NDArray[np.float64], at_y: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Return the wavefront at points of the entrance pupil, mm."""
         own = self.cornea_um.copy()
         own[1, 0] = own[0, 1] = 0.0
         by_x, by_y = polyder(own, axis=0), polyder(own, axis=1)
@@ -144,8 +165,7 @@ class FlatScene:
             from_x = at_x - DEPTH_MM * slopes[0] / 1e3
             from_y = at_y - DEPTH_MM * slopes[1] / 1e3
         value = polyval2d(from_x, from_y, own)
-        value = value + DEPTH_MM * (slopes[0] ** 2 + slopes[1] ** 2) / 2e3
-        return np.einsum("tij,ij,ij->t", zernike_values(), value, weight)
+        return value + DEPTH_MM * (slopes[0] ** 2 + slopes[1] ** 2) / 2e3
 
     def kernel(self, wavelength_nm: float) -> NDArray[np.float64]:
         """Return the PSF of a channel, wide enough to reach over the whole image."""
