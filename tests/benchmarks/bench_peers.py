@@ -1,6 +1,7 @@
 """Alternatives to this filter: time and error of one frame by method.
 
     python -m tests.benchmarks.bench_peers [--quick] [--json] [--engines NAME ...]
+        [--rows KIND ...]
 
 All methods run one after the other and round after round (A B C, A B C), after a
 warm-up.  In the first rounds, pupil and focus change with every frame (`frame_runs`),
@@ -21,6 +22,9 @@ Single PSFs: those that ISETBio distributed, and ours of the same Zernike coeffi
 and that of the schematic eye on its axis, by rays, which DeepLens traces too.  Their
 error is the share of the light that is elsewhere.
 
+The gradient of the light in an image by the radius of the cornea, at one distance: ours,
+optiland and DeepLens (`peer_gradients`).
+
 A row says what its method does otherwise, or more; one that is not installed has a row
 too, and one that only its authors can measure has the figures that they printed.
 `sh setup.sh peers` installs what can be installed.
@@ -31,7 +35,7 @@ import json
 import sys
 import time
 from contextlib import closing, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 
@@ -45,6 +49,7 @@ from tests.benchmarks.image_measures import channel_psnr_db
 from tests.benchmarks.peer_blender import blender
 from tests.benchmarks.peer_deeplens import deeplens, traced_psf
 from tests.benchmarks.peer_ffmpeg import FRAMES, varblur
+from tests.benchmarks.peer_gradients import SETTING, gradient_methods
 from tests.benchmarks.peer_isetbio import moved_light, our_psf, published_psfs
 from tests.benchmarks.peer_layers import fft_layers, opencv_layers
 from tests.benchmarks.peer_optiland import EYE, Optiland, flat_problem, optiland_peers
@@ -75,6 +80,9 @@ SLOW_MS = 5000.0
 EDGE_RATIO = 1 / 9
 """Of the height, left out along the edges of the flat scene, beyond which the methods
 assume different light."""
+
+ROWS = ("layers", "field", "psf", "gradient", "printed")
+"""Kinds of rows, in the order in which they are measured."""
 
 RAYS = 8192
 """Of a traced PSF: DeepLens's default."""
@@ -436,6 +444,29 @@ def traced_rows(view) -> list[PeerRow]:
     ]
 
 
+def gradient_rows() -> list[PeerRow]:
+    """Rows of the gradient of defocus, whose errors are relative."""
+    rows = []
+    for peer in gradient_methods():
+        found, missing = None, None
+        try:
+            found = peer.gradient()
+        except NotInstalled as error:
+            missing = str(error)
+        row = psf_row(
+            method=peer.name,
+            case="schematic eye, cornea",
+            setting=SETTING,
+            taken_ms=None if found is None else found.taken_ms,
+            error=None if found is None else found.error,
+            reference=peer.reference,
+            differs=peer.differs,
+            missing=missing,
+        )
+        rows.append(replace(row, error_name="relative"))
+    return rows
+
+
 def printed_rows() -> list[PeerRow]:
     """Rows of methods that only their authors could measure."""
     return [
@@ -476,7 +507,7 @@ HEADER = (
 
 
 def line_of(row: PeerRow) -> str:
-    """One line of the table; errors are dB, or shares of light."""
+    """One line of the table; errors are dB, shares of light, or relative."""
     start = f"{row.case:<34}{row.method:<28}"
     if row.missing is not None:
         return f"{start}not installed: {row.missing}"
@@ -485,7 +516,7 @@ def line_of(row: PeerRow) -> str:
         f"{'' if ms is None else f'{ms:.1f}':>{width}}"
         for ms, width in zip(times, (9, 9, 13, 9), strict=True)
     ]
-    digits = 1 if row.error_name == "psnr_db" else 3
+    digits = {"psnr_db": 1, "moved_light_ratio": 3}.get(row.error_name, 5)
     cells += [
         f"{'' if error is None else f'{error:.{digits}f}':>{width}}"
         for error, width in ((row.error, 8), (row.other_error, 7))
@@ -500,6 +531,7 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="320x180, fewer rounds")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     parser.add_argument("--engines", nargs="+", choices=ENGINES, default=ENGINES)
+    parser.add_argument("--rows", nargs="+", choices=ROWS, default=ROWS)
     arguments = parser.parse_args()
     width_px, height_px = QUICK_SIZE if arguments.quick else SIZE
     repeats = QUICK_REPEATS if arguments.quick else REPEATS
@@ -514,11 +546,16 @@ def main() -> None:
     ]
     disc = Problem(view, EYES["-6 dpt"], DISC_SETTINGS)
     cases.append((DISC_CASE, disc, [*ours_first, *DISC_PEERS]))
-    parts = [partial(peer_rows, p, case, peers, repeats) for case, p, peers in cases]
-    parts.append(partial(flat_rows, flat_view, engines, repeats))
+    layers = [partial(peer_rows, p, case, peers, repeats) for case, p, peers in cases]
+    parts = {
+        "layers": layers,
+        "field": [partial(flat_rows, flat_view, engines, repeats)],
+        "psf": [partial(traced_rows, view), isetbio_rows],
+        "gradient": [gradient_rows],
+        "printed": [printed_rows],
+    }
     rows = []
-    parts.append(partial(traced_rows, view))
-    for part in (*parts, isetbio_rows, printed_rows):
+    for part in (part for name in arguments.rows for part in parts[name]):
         found = part()
         rows += found
         print(*map(line_of, found), sep="\n", file=sys.stderr, flush=True)
@@ -529,7 +566,7 @@ def main() -> None:
         print(json.dumps(content))
         return
     print(HEADER, *map(line_of, rows), sep="\n")
-    if not arguments.quick:
+    if not arguments.quick and list(arguments.rows) == list(ROWS):
         write_report("peers", content)
 
 

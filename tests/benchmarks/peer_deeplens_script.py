@@ -86,9 +86,8 @@ def lens_file(surfaces, stop_z_mm, retina, stop_radius_mm, pixel_mm, side_px):
     }
 
 
-def traced_psf(folder, eye, wavelength_nm, pupil_mm, pitch, side_px, rays):
-    """PSF of a point on the axis, by rays, and the seconds that it took."""
-    import torch
+def opened_lens(folder, eye, pupil_mm, pitch, side_px):
+    """An eye as a lens with a sensor, and the size of its pixels."""
     from deeplens import GeoLens
 
     def lens(stop_radius_mm, pixel_mm):
@@ -102,7 +101,15 @@ def traced_psf(folder, eye, wavelength_nm, pupil_mm, pitch, side_px, rays):
     first = lens(pupil_mm / 2, pitch * FOCAL_LENGTH_MM)
     focal_length_mm = float(first.foclen) / eye["surfaces"][-1]["index_after"]
     stop_radius_mm = (pupil_mm / 2) ** 2 / float(first.entr_pupilr)
-    opened = lens(stop_radius_mm, pitch * focal_length_mm)
+    pixel_mm = pitch * focal_length_mm
+    return lens(stop_radius_mm, pixel_mm), pixel_mm
+
+
+def traced_psf(folder, eye, wavelength_nm, pupil_mm, pitch, side_px, rays):
+    """PSF of a point on the axis, by rays, and the seconds that it took."""
+    import torch
+
+    opened, _ = opened_lens(folder, eye, pupil_mm, pitch, side_px)
     point = torch.tensor([[0.0, 0.0, -FARTHEST_MM]])
     seconds = []
     for _ in range(2):  # the first warms up
@@ -112,6 +119,33 @@ def traced_psf(folder, eye, wavelength_nm, pupil_mm, pitch, side_px, rays):
         seconds.append(time.perf_counter() - start_s)
     np.save(Path(folder) / "out.npy", psf[0].numpy())
     return {"seconds": seconds[1]}
+
+
+def gradient(folder, eye, wavelength_nm, pupil_mm, pitch, rays):
+    """Derivative of a PSF's sum, weighted with a blob, by the radius of the cornea."""
+    import torch
+
+    torch.manual_seed(0)
+    blob = torch.from_numpy(np.load(Path(folder) / "blob.npy").astype(np.float32))
+    side_px = len(blob)
+    opened, pixel_mm = opened_lens(folder, eye, pupil_mm, pitch, side_px)
+    cornea = opened.surfaces[0]
+    curvature_per_mm = cornea.c.detach().clone()
+    point = torch.tensor([[0.0, 0.0, -FARTHEST_MM]])
+    for _ in range(2):  # the first warms up
+        start_s = time.perf_counter()
+        cornea.c = curvature_per_mm.clone().requires_grad_()
+        psf = opened.psf(point, ks=side_px, wvln=wavelength_nm / 1000.0, spp=rays)[0]
+        light = blob @ psf @ blob
+        light.backward()
+        taken_s = time.perf_counter() - start_s
+    slope = float(cornea.c.grad) * -float(curvature_per_mm) ** 2  # c = 1 / R
+    return {
+        "gradient": slope,
+        "light": float(light),
+        "pixel_mm": pixel_mm,
+        "seconds": taken_s,
+    }
 
 
 class Defocus:
@@ -166,4 +200,11 @@ if __name__ == "__main__":
     from peer_answers import answer_requests
 
     defocus = Defocus()
-    answer_requests({"open": defocus.open, "frame": defocus.frame, "psf": traced_psf})
+    answer_requests(
+        {
+            "open": defocus.open,
+            "frame": defocus.frame,
+            "psf": traced_psf,
+            "gradient": gradient,
+        }
+    )

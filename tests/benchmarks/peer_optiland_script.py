@@ -261,6 +261,51 @@ def eigen_basis(eye, shape, n_components):
     return [np.asarray(part, np.float32) for part in (eigen_psfs, maps, mean_psf)]
 
 
+def pixel_weights(blob, pitch, step, size):
+    """Mean of a blob, which pixels sample, over the cells of a PSF's samples (size,)."""
+    edges = (np.arange(len(blob) + 1) - len(blob) / 2) * pitch
+    sums = np.concatenate([[0.0], np.cumsum(blob) * pitch])
+    ends = (np.arange(size + 1) - size // 2 - 0.5) * step
+    return np.diff(np.interp(ends, edges, sums)) / step
+
+
+def gradient(folder, eye, wavelength_nm, pupil_mm, pitch):
+    """Derivative of a PSF's sum, weighted with a blob, by the radius of the cornea."""
+    import optiland.backend as backend
+
+    backend.set_backend("torch")
+    backend.set_precision("float64")
+    backend.grad_mode.enable()
+    import torch
+    from optiland.psf.fft import FFTPSF
+
+    half = 0.5 * pitch
+    camera = Camera((-half, half, half, -half), (1, 1))
+    own = Eye(**eye, wavelength_nm=wavelength_nm, pupil_mm=pupil_mm, camera=camera)
+    geometry = own.optic.surfaces[1].geometry
+    radius_mm = float(geometry.radius)
+    size = max(math.ceil(SAMPLES_PER_PX * own._period / pitch), RAYS)
+    blob = np.load(Path(folder) / "blob.npy")
+    weights = torch.tensor(pixel_weights(blob, pitch, own._period / size, size))
+    inside = torch.tensor(
+        pixel_weights(np.ones_like(blob), pitch, own._period / size, size)
+    )
+    for _ in range(2):  # the first warms up
+        start_s = time.perf_counter()
+        geometry.radius = torch.tensor(radius_mm, dtype=torch.float64).requires_grad_()
+        psf = FFTPSF(
+            own.optic,
+            (0.0, 0.0),
+            own.wavelength_um,
+            num_rays=RAYS,
+            grid_size=size,
+        ).psf
+        light = (weights @ psf @ weights) / (inside @ psf @ inside)
+        light.backward()
+        taken_s = time.perf_counter() - start_s
+    return {"gradient": float(geometry.radius.grad), "seconds": taken_s}
+
+
 class Simulation:
     """What the requests are about: an eye, a camera and a picture."""
 
@@ -329,5 +374,6 @@ if __name__ == "__main__":
             "open": simulation.open,
             "frame": simulation.frame,
             "reference": simulation.reference,
+            "gradient": gradient,
         }
     )
