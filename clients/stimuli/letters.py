@@ -245,7 +245,7 @@ def _on_background(
         name = f"{name}_{contrast:g}"
     parameters = {
         **parameters,
-        "contrast": contrast,
+        "weber_contrast": contrast,
         "background_light": background_light,
     }
     light = background_light * (1.0 + contrast * shares)

@@ -89,7 +89,7 @@ def grating(
         "frequency_cpd": frequency_cpd,
         "orientation_deg": orientation_deg,
         "phase_deg": phase_deg,
-        "contrast": contrast,
+        "michelson_contrast": contrast,
         "mean_light": mean_light,
         "diameter_arcmin": diameter_arcmin,
     }
@@ -179,7 +179,7 @@ def edge(
     parameters = {
         "kind": "edge",
         "orientation_deg": orientation_deg,
-        "contrast": contrast,
+        "michelson_contrast": contrast,
         "mean_light": mean_light,
     }
     light = mean_light * (1.0 + contrast * profile)

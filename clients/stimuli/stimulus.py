@@ -57,24 +57,25 @@ class Stimulus:
         return RgbdView(self.linear_rgb, depth_m, self.display.camera.tangents)
 
     def described(self) -> dict[str, Any]:
-        """Return parameters, measured light and notes, for JSON.
-
-        Mean, least and most light and the Michelson contrast are those of the pixels.
-        """
+        """Return parameters, what the pixels measure, and notes, for JSON."""
         light = self.light.astype(np.float64)
         low, high = float(light.min()), float(light.max())
-        measured = {"mean": float(light.mean()), "least": low, "most": high}
         total = low + high
-        found = {
+        measured = {
+            "mean_light": float(light.mean()),
+            "least_light": low,
+            "most_light": high,
+            "michelson_contrast": (high - low) / total if total > 0.0 else 0.0,
+        }
+        if (white_nit := self.display.white_nit) is not None:
+            for name in ("mean", "least", "most"):
+                measured[f"{name}_nit"] = white_nit * measured[f"{name}_light"]
+        return {
             "name": self.name,
             **self.parameters,
-            "light_ratio": measured,
-            "michelson_contrast": (high - low) / total if total > 0.0 else 0.0,
+            "measured": measured,
             "notes": list(self.notes),
         }
-        if (white := self.display.white_nit) is not None:
-            found["luminance_nit"] = {k: white * v for k, v in measured.items()}
-        return found
 
 
 def stimulus(

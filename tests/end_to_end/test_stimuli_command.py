@@ -56,7 +56,7 @@ def test_pictures_and_their_listing(tmp_path):
             metadata = json.loads(image.text[METADATA_KEY])
         assert metadata["stimulus"]["name"] == name
     grating = found["stimuli"]["sine_6cpd_90deg_0deg_0.8"]
-    assert grating["luminance_nit"]["most"] == pytest.approx(90.0, rel=0.01)
+    assert grating["measured"]["most_nit"] == pytest.approx(90.0, rel=0.01)
     drawn = read_color(out / grating["file"])
     display = stimuli.Display(width_px=48, height_px=40, pixel_arcmin=0.5)
     np.testing.assert_array_equal(

@@ -304,9 +304,10 @@ def test_the_light_of_letters_has_their_weber_contrast(
     )
     assert found.light[0, 0] == pytest.approx(background_light)
     assert found.light[68, 80] == pytest.approx(letter_light)
-    luminance = found.described()["luminance_nit"]
+    measured = found.described()["measured"]
     ends = sorted([200.0 * letter_light, 200.0 * background_light])
-    assert [luminance["least"], luminance["most"]] == pytest.approx(ends)
+    assert [measured["least_nit"], measured["most_nit"]] == pytest.approx(ends)
+    assert found.parameters["weber_contrast"] == contrast
 
 
 def test_files_hold_the_light_that_is_told(tmp_path):
