@@ -214,9 +214,10 @@ def best_lens(
     -----
     The start is the correction with the highest visual Strehl ratio for the first
     scene with the farthest focus.  Its sphere is scanned in steps of 0.5 dpt, and
-    COBYQA, a derivative-free trust-region method, continues from the best (Ragonneau and Zhang,
-    2023, as implemented in SciPy).  The image magnification by spectacles and
-    yellowing are not errors and are left out.
+    COBYQA, a derivative-free trust-region method, continues from the best (Ragonneau
+    and Zhang, 2023, as implemented in SciPy).  PSFs are exact for scenes at one
+    distance.  Magnification by spectacles, displacement of the whole image, and
+    yellowing are not errors.
     """
     body = {"kind": "spectacles", "vertex_mm": VERTEX_MM} | dict(lens or {})
     check_choice("lens.kind", body["kind"], LENS_KINDS)

@@ -17,7 +17,7 @@ EXAMPLES = ROOT / "examples"
 SCRIPTS = sorted(EXAMPLES.glob("[0-9]*.py"))
 OUT = Path("out/examples")
 PAGE = (EXAMPLES / "README.md").read_text(encoding="utf-8")
-PICTURES_MB = 0.5
+PICTURES_MB = 0.65
 
 
 @pytest.fixture
@@ -158,11 +158,40 @@ def test_a_card_that_was_solved_for_a_viewer_shows_more_contrast(run, capsys):
     assert 0.1 < gains[0] < gains[1] - 0.5
 
 
+@pytest.mark.clients
+@pytest.mark.slow
+def test_a_scene_is_recovered_until_noise_prevails(run, capsys):
+    page = run("12_deblur")
+    scene, seen, few = (cell(page, 0, column, (2, 3)) for column in (0, 1, 2))
+    many = cell(page, 1, 1, (2, 3))
+    assert detail(seen) < detail(few) < detail(many)
+    assert detail(scene) < detail(many)
+    said = capsys.readouterr().out
+    assert "PyTorch is not installed" in said or "gradients: " in said
+    seen_db, few_db, some_db, many_db = map(
+        float, re.findall(r"(?:noise|steps): ([\d.]+) dB", said)
+    )
+    assert seen_db + 1.0 < few_db < some_db > many_db + 2.0
+
+
+@pytest.mark.clients
+@pytest.mark.slow
+def test_the_best_lens_sharpens_the_card(run, capsys):
+    page = run("13_best_lens")
+    before, after = (cell(page, 0, column, (2, 3)) for column in (1, 2))
+    assert detail(after) > 1.5 * detail(before)
+    far, both = (cell(page, 1, column, (2, 3)) for column in (1, 2))
+    assert detail(far) > 1.2 * detail(both)
+    said = capsys.readouterr().out
+    assert re.search(r"keratoconus, far: -\d\.\d\d / -\d\.\d\d x \d+, rounded -", said)
+    assert re.search(r"60 years, far and near: \+0\.\d\d, rounded \+0\.\d\d ", said)
+
+
 def test_every_example_is_on_the_page_with_its_picture():
     named = re.findall(r"\[`(\d\d_\w+\.(?:py|ipynb))`\]\(\1\)", PAGE)
     files = sorted(p.name for p in EXAMPLES.glob("[0-9]*"))
     assert named == files
-    assert len(SCRIPTS) == 10
+    assert len(SCRIPTS) == 12
     for name in files:
         assert f"](pictures/{Path(name).stem}.jpg)" in PAGE
     pictures = list((EXAMPLES / "pictures").glob("*.jpg"))
