@@ -49,7 +49,7 @@ def test_the_examples_of_a_page_run(path, tmp_path):
     if path.stem == "stereo":
         assert printed == "[(90, 160, 3), (90, 160, 3)]\n"
     if path.stem == "correct":
-        assert printed == "(64, 96, 3) True\nTrue\n(64, 96, 3) True\n"
+        assert printed == "(64, 96, 3) True\nTrue\n(64, 96, 3) True\n-2.0 True\n"
     if path.stem == "stream":
         assert re.fullmatch(r"\(90, 160, 3\) [\d.]+ ms\n", printed)
     if path.stem == "pyrender":
