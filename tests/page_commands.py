@@ -35,7 +35,7 @@ ENDLESS = ("serve", "web", "layer serve", "layer run", "headset --left")
 """Commands that run until they are stopped, or need a headset."""
 
 SLOW = (
-    *("doctor", "report", "batch", "latency", "headset --simulated"),
+    *("doctor", "report", "batch", "latency", "best-lens", "headset --simulated"),
     *(r"field .* --people", r"stimuli .* -p "),
 )
 """Commands, as patterns, that take seconds."""

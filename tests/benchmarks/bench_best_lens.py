@@ -4,12 +4,12 @@
 
 Eyes of -2 dpt, with astigmatism, with keratoconus, after LASIK, and of 60 years look
 through 3 and 5 mm at letters and a photograph of scikit-image, far away, and at a
-courtyard with depth, relaxed; the last one also at letters and photographs both far away and at
-0.4 m, through single-vision and progressive lenses.  The lens of the search is compared
-with the one of the highest visual Strehl ratio: error by the measure of the search,
-retinal PSNR, visual Strehl ratio and acuity for far objects.  A grid of 26 lenses 0.1
-dpt around the result (power vector at the pupil) shows whether it is a minimum.  Writes
-results/best_lens.json.
+courtyard with depth, relaxed; the last one also at letters and photographs both far
+away and at 0.4 m, through single-vision and progressive lenses.  The lens of the search
+is compared with the one of the highest visual Strehl ratio: error by the measure of the
+search, retinal PSNR, visual Strehl ratio and acuity for far objects.  A grid of 26
+lenses 0.1 dpt around the result (power vector at the pupil) shows whether it is a
+minimum.  Writes results/best_lens.json.
 """
 
 import argparse
