@@ -1,11 +1,22 @@
-"""Derivatives of images against Richardson differences of the filter at other steps."""
+"""Derivatives of images against differences of the filter at other steps, and against
+the derivatives of images by quadrature.
+"""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from filter_service import Camera, EyeFilter, FilterSettings, image_derivatives
+from filter_service import (
+    Camera,
+    EyeFilter,
+    FilterSettings,
+    RgbdView,
+    image_derivatives,
+)
 from filter_service.errors import BadMessage
 from filter_service.filtering.derivatives import PROFILE_STEPS, STEPS
+from tests.reference.flat_image import FlatScene, derivative, wavefront_of_profile
 
 WIDTH, HEIGHT = 36, 24
 CAMERA = Camera.from_fov(1.8, width_px=WIDTH, height_px=HEIGHT)
@@ -148,3 +159,99 @@ def test_a_difference_beyond_the_prepared_range_raises(eye_filter, color, depth_
     state = {**STATE, "pupil_diameter_mm": 6.95}
     with pytest.raises(BadMessage, match=r"read 7\.03.*2 to 7, .*pupil_range_mm"):
         image_derivatives(eye_filter, color, depth_m, ["pupil_diameter_mm"], **state)
+
+
+SMOOTH = 0.2 + 0.6 * np.exp(
+    -np.add.outer((np.arange(16) - 7.0) ** 2, (np.arange(20) - 9.0) ** 2) / 8.0
+)
+SMOOTH_CAMERA = Camera.from_fov(0.7, width_px=20, height_px=16)
+ONE_COLOR = FilterSettings(mode="on-axis", eye_model="wavefront", chromatic=False)
+MYOPIA = {"kind": "prescription", "sphere_dpt": -2.0, "higher_order": "none"}
+SPHERICAL = {
+    "kind": "zernike",
+    "pupil_diameter_mm": 5.0,
+    "wavelength_nm": 587.56,
+    "zernike_um": {"2,0": 0.4, "4,0": 0.1},
+}
+
+
+@pytest.mark.long("PSFs by quadrature")
+@pytest.mark.parametrize(
+    ("profile", "name", "focus_dpt"),
+    [
+        (MYOPIA, "pupil_diameter_mm", 2.6),
+        pytest.param(MYOPIA, "focus_dpt", 2.6, marks=pytest.mark.slow),
+        pytest.param(MYOPIA, "profile.sphere_dpt", 0.0, marks=pytest.mark.slow),
+        (SPHERICAL, "profile.zernike_um.4,0", 0.0),
+    ],
+)
+def test_fine_derivatives_are_those_of_quadrature(profile, name, focus_dpt):
+    pupil_mm, object_dpt = 3.0, 1.3
+    color = np.repeat(SMOOTH[..., None], 3, axis=2).astype(np.float32)
+    depth_m = np.full(SMOOTH.shape, 1.0 / object_dpt, np.float32)
+    view = RgbdView(color, depth_m, SMOOTH_CAMERA.tangents, depth_kind="radial")
+    with EyeFilter(profile, SMOOTH_CAMERA, ONE_COLOR) as eye_filter:
+        found = image_derivatives(
+            *(eye_filter, color, view, [name]),
+            pupil_diameter_mm=pupil_mm,
+            focus_dpt=focus_dpt,
+            profile=profile,
+            accuracy="fine",
+        )[name]
+    cornea_um, measured_nm = wavefront_of_profile(profile)
+    scene = FlatScene(
+        cornea_um=cornea_um,
+        measured_nm=measured_nm,
+        pupil_diameter_mm=pupil_mm,
+        focus_dpt=focus_dpt,
+        object_dpt=object_dpt,
+        light=SMOOTH,
+        pitch_mrad=SMOOTH_CAMERA.pixel_pitch_mrad,
+    )
+
+    def image_at(value):
+        if hasattr(scene, name):
+            own = replace(scene, **{name: value})
+        elif name.endswith("sphere_dpt"):
+            own = scene.with_power(value)
+        else:
+            own = scene.with_term(4, 0, value, profile["pupil_diameter_mm"] / 2.0)
+        return own.image()[..., 0]
+
+    expected = derivative(image_at, getattr(scene, name, 0.0), 0.02)
+    size = np.vdot(expected, expected)
+    np.testing.assert_array_equal(found[..., 0], found[..., 1])
+    own = found[..., 1]
+    assert np.vdot(own, expected) / size == pytest.approx(1.0, abs=1e-3)
+    assert np.linalg.norm(own - expected) < 2e-3 * size**0.5
+
+
+@pytest.mark.slow
+def test_fine_derivatives_of_several_distances(eye_filter, color, depth_m):
+    """Beyond edges of depth, both accuracies differ by the error of the normal one."""
+    near_m = np.where(depth_m == 0.5, 0.5, 0.9).astype(np.float32)
+    normal, fine = (
+        image_derivatives(
+            *(eye_filter, color, near_m, ["focus_dpt"]), **STATE, accuracy=accuracy
+        )["focus_dpt"]
+        for accuracy in ("normal", "fine")
+    )
+    columns = np.abs(np.arange(WIDTH) - 13.5) > 4.0
+    check(normal[:, columns], fine[:, columns].astype(float))
+
+
+def test_unknown_accuracies_and_settings_without_quadrature_raise(
+    eye_filter, color, depth_m
+):
+    with pytest.raises(BadMessage, match="accuracy: 'exact'.*normal or fine"):
+        image_derivatives(
+            *(eye_filter, color, depth_m, ["focus_dpt"]), **STATE, accuracy="exact"
+        )
+    settings = SETTINGS.changed(diffraction=False)
+    with (
+        EyeFilter(PROFILE, CAMERA, settings) as other,
+        pytest.raises(BadMessage, match="accuracy: 'fine'.*without diffraction"),
+    ):
+        image_derivatives(
+            *(other, color, depth_m, ["focus_dpt"]), **STATE, accuracy="fine"
+        )
