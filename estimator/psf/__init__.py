@@ -9,6 +9,7 @@ drawing            PSFs on the axes of a figure
 pupil              pupils in pixel coordinates
 survey             wavefront slopes and kernel radii, before any PSF is computed
 switch             choice of wave or ray optics, by predicted error
+quadrature         PSFs in double precision, for derivatives
 fourier            sampling of wave-optical PSFs
 tables             tables and constants of the engine
 enz                wave optics by the extended Nijboer-Zernike series

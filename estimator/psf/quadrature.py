@@ -107,12 +107,12 @@ def spot_by_quadrature(
     y = np.cos(turn)[:, None] * node
     weights = step * np.cos(turn)[:, None] ** 2 * weight / math.pi
     box_y = shear * x + root * y
-    wave = per_um * _polynomial(frames.disc_polynomial_um[psf], x, y)
+    phase = per_um * _polynomial(frames.disc_polynomial_um[psf], x, y)
     log = frames.log_amplitude[psf]
     powers = np.ones_like(x), x, box_y, x * x, x * box_y, box_y * box_y
     amplitude = np.exp(sum(c * own for c, own in zip(log, powers, strict=True)))
     passed_ratio = float((weights * amplitude**2).sum())
-    field = weights * amplitude * np.exp(1j * wave)
+    field = weights * amplitude * np.exp(1j * phase)
     pixels = np.arange(-radius_px, radius_px + 1)
     (at_x, weight_x), (at_y, weight_y) = (
         _gauss_legendre(math.ceil(b / 2.0 + 1.2 * b ** (1.0 / 3.0) + 2.0))
@@ -134,15 +134,15 @@ def spot_by_quadrature(
             inner[..., i : i + part_size] @ turns[:, i : i + part_size]
             for i in range(0, count, part_size)
         )
-    chords = chords.reshape(turn.size, -1)
+    of_columns = chords.reshape(turn.size, -1)
     columns = per_um * half[0] * np.sin(turn)
     at = np.exp(-1j * (pixels[:, None, None] + at_x[:, None] / 2.0) * columns)
-    light = np.empty((pixels.size, chords.shape[1]))
+    light = np.empty((pixels.size, of_columns.shape[1]))
     part_size = max(1, ONE_THREAD_PRODUCT // (at_x.size * turn.size))
     for first in range(0, light.shape[1], part_size):
         part = slice(first, first + part_size)
-        own = at @ chords[:, part]
-        light[:, part] = weight_x / 2.0 @ (own.real**2 + own.imag**2)
+        wave = at @ of_columns[:, part]
+        light[:, part] = weight_x / 2.0 @ (wave.real**2 + wave.imag**2)
     shape = pixels.size, at_y.size, pixels.size
     kernel = np.einsum("xgy,g->yx", light.reshape(shape), weight_y / 2.0)
     area = math.pi * float(half[0] * half[1]) * root
@@ -186,9 +186,7 @@ def quadrature_kernels(
     def kernel(psf: int) -> NDArray[np.float64]:
         own = {name: _item(value, psf) for name, value in arguments.items()}
         radius = int(radius_px[psf])
-        whole = compute_psf_batch(
-            zernike_um[psf : psf + 1], radius_px=radius, **own
-        )[0]
+        whole = compute_psf_batch(zernike_um[psf : psf + 1], radius_px=radius, **own)[0]
         found = whole.kernel.astype(np.float64) * (1.0 - whole.lost_energy_ratio)
         spot_px = float(survey.blur_radius_px[psf])
         if spot_px > MAX_SPOT_PX:

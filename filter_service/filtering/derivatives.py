@@ -199,9 +199,7 @@ class _Frames:
         is_sequence = not isinstance(self._depth_m, RgbdView | np.ndarray)
         return frozen_operator(planned, self._frozen, is_sequence=is_sequence)
 
-    def _planned(
-        self, eye_filter: EyeFilter, state: Mapping[str, Any]
-    ) -> PlannedFrame:
+    def _planned(self, eye_filter: EyeFilter, state: Mapping[str, Any]) -> PlannedFrame:
         views = views_of_depth(self._depth_m, next(iter(eye_filter.cameras), None))
         states = [State.checked(**state)] * len(views)
         while not (planned := eye_filter.plan(views, states, newest_only=True)):

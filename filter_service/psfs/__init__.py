@@ -7,6 +7,7 @@ pack             kernels cropped to boxes, in 16 bits, and tables
 store            the PSFs of an eye
 frame_layers     interpolation for a state, and the layers of a frame
 exact_store      PSFs of a single state, for frames with a render tolerance of 0
+frozen_store     PSFs of a single state in 32 bits, for derivatives
 field_defocus    change of defocus over the field
 store_cache      on-disk cache of eyes and nodes, its folder and contents
 store_file       file format of the on-disk cache

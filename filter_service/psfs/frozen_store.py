@@ -11,7 +11,6 @@ from __future__ import annotations
 import math
 from collections import Counter
 from dataclasses import dataclass, replace
-from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -103,8 +102,6 @@ class FrozenStore(ExactStore):
     size_px : (width, height)
         Of the image, over which kernels extend.
     """
-
-    has_fine_kernels: ClassVar[bool] = True
 
     def __init__(
         self,

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import cached_property, partial
 from itertools import product
-from typing import TYPE_CHECKING, Any, ClassVar, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -95,9 +95,6 @@ class PsfStore:
     """
 
     nodes: PlanNodes
-
-    has_fine_kernels: ClassVar[bool] = False
-    """Whether kernels have 32 bits, at one distance per interval; see `FrozenStore`."""
 
     def __init__(
         self,

@@ -163,15 +163,19 @@ def richardson(profile: dict, view: RgbdView, parameter: str, state: dict):
             terms = profile[keys[0]]
             own = {**profile, keys[0]: {**terms, keys[1]: terms[keys[1]] + change}}
         with EyeFilter(own, CAMERA, SETTINGS) as eye_filter:
-            return eye_filter.filter(
-                view,
-                **own_state,
-                output="linear",
-                whole=True,
-                merge=False,
-                bright_pixels=False,
-                render_tolerance=0.0,
-            ).color[..., 1].astype(float)
+            return (
+                eye_filter.filter(
+                    view,
+                    **own_state,
+                    output="linear",
+                    whole=True,
+                    merge=False,
+                    bright_pixels=False,
+                    render_tolerance=0.0,
+                )
+                .color[..., 1]
+                .astype(float)
+            )
 
     short, long = (
         (image_at(h) - image_at(-h)) / (2.0 * h)
@@ -218,9 +222,7 @@ def rows_of(name: str) -> Iterator[Row]:
                         for reference, own in scenes.items()
                     }
                 else:
-                    truths = {
-                        "Richardson": richardson(profile, view, parameter, state)
-                    }
+                    truths = {"Richardson": richardson(profile, view, parameter, state)}
                 yield from _rows(name, setting, profile, view, parameter, state, truths)
 
 

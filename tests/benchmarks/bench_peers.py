@@ -22,8 +22,8 @@ Single PSFs: those that ISETBio distributed, and ours of the same Zernike coeffi
 and that of the schematic eye on its axis, by rays, which DeepLens traces too.  Their
 error is the share of the light that is elsewhere.
 
-The gradient of the light in an image by the radius of the cornea, at one distance: ours,
-optiland and DeepLens (`peer_gradients`).
+The gradient of the light in an image by the radius of the cornea, at one distance, of
+ours, optiland and DeepLens (`peer_gradients`).  Its error is relative.
 
 A row says what its method does otherwise, or more; one that is not installed has a row
 too, and one that only its authors can measure has the figures that they printed.

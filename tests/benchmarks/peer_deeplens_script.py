@@ -139,7 +139,7 @@ def gradient(folder, eye, wavelength_nm, pupil_mm, pitch, rays):
         light = blob @ psf @ blob
         light.backward()
         taken_s = time.perf_counter() - start_s
-    slope = float(cornea.c.grad) * -float(curvature_per_mm) ** 2  # c = 1 / R
+    slope = float(cornea.c.grad) * -(float(curvature_per_mm) ** 2)  # c = 1 / R
     return {
         "gradient": slope,
         "light": float(light),

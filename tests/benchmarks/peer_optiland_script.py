@@ -262,7 +262,7 @@ def eigen_basis(eye, shape, n_components):
 
 
 def pixel_weights(blob, pitch, step, size):
-    """Mean of a blob, which pixels sample, over the cells of a PSF's samples (size,)."""
+    """Means (size,) of a blob in pixels over the cells of a PSF's samples."""
     edges = (np.arange(len(blob) + 1) - len(blob) / 2) * pitch
     sums = np.concatenate([[0.0], np.cumsum(blob) * pitch])
     ends = (np.arange(size + 1) - size // 2 - 0.5) * step

@@ -243,14 +243,14 @@ def test_fine_derivatives_of_several_distances(eye_filter, color, depth_m):
 def test_unknown_accuracies_and_settings_without_quadrature_raise(
     eye_filter, color, depth_m
 ):
-    with pytest.raises(BadMessage, match="accuracy: 'exact'.*normal or fine"):
+    with pytest.raises(BadMessage, match=r"accuracy: 'exact'.*normal or fine"):
         image_derivatives(
             *(eye_filter, color, depth_m, ["focus_dpt"]), **STATE, accuracy="exact"
         )
     settings = SETTINGS.changed(diffraction=False)
     with (
         EyeFilter(PROFILE, CAMERA, settings) as other,
-        pytest.raises(BadMessage, match="accuracy: 'fine'.*without diffraction"),
+        pytest.raises(BadMessage, match=r"accuracy: 'fine'.*without diffraction"),
     ):
         image_derivatives(
             *(other, color, depth_m, ["focus_dpt"]), **STATE, accuracy="fine"

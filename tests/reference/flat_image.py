@@ -128,9 +128,7 @@ class FlatScene:
 
     def with_term(self, n: int, m: int, um: float, radius_mm: float) -> "FlatScene":
         """Return the scene with a Zernike term of a circle added to the eye."""
-        return replace(
-            self, cornea_um=self.cornea_um + _in_mm({(n, m): um}, radius_mm)
-        )
+        return replace(self, cornea_um=self.cornea_um + _in_mm({(n, m): um}, radius_mm))
 
     @cached_property
     def wavefront_um(self) -> NDArray[np.float64]:
@@ -223,9 +221,7 @@ def wavefront_of_profile(profile: dict) -> tuple[NDArray[np.float64], float]:
     cylinder_dpt = profile.get("cylinder_dpt", 0.0)
     angle = 2.0 * math.radians(180.0 - profile.get("axis_deg", 0.0))
     mean_dpt = profile["sphere_dpt"] + cylinder_dpt / 2.0
-    j0_dpt, j45_dpt = (
-        -cylinder_dpt / 2.0 * f(angle) for f in (math.cos, math.sin)
-    )
+    j0_dpt, j45_dpt = (-cylinder_dpt / 2.0 * f(angle) for f in (math.cos, math.sin))
     found = np.zeros((ORDER + 1, ORDER + 1))
     found[2, 0], found[0, 2] = -(mean_dpt + j0_dpt) / 2.0, -(mean_dpt - j0_dpt) / 2.0
     found[1, 1] = -j45_dpt

@@ -576,7 +576,7 @@ class FrameRecord:
 
     def set_store(self, handle: NativeStore) -> None:
         """Set pointers to the cached kernels."""
-        self.c.has_fine_kernels = handle.store.has_fine_kernels
+        self.c.has_fine_kernels = isinstance(handle.store, FrozenStore)
         for r, stored in enumerate(handle.resolutions):
             self.c.store[r] = self._pointer_to(stored.words)
             self.c.store_first[r] = self._pointer_to(stored.first_texel)
