@@ -18,6 +18,7 @@ from estimator.acuity.transfer import (
     HIGHEST_CPD,
     NM_PER_MM,
     UM_PER_MM,
+    check_known,
     clear_pupil,
     grid_wavefront_um,
     neural_sensitivity,
@@ -57,7 +58,13 @@ def best_correction_um(
         See `optical_transfer`.
     n_samples : int
         Number of samples across the circle.
+
+    Raises
+    ------
+    ValueError
+        A coefficient is not finite, or the screen is a lattice of lenslets.
     """
+    check_known(zernike_um, pupil_screen)
     ratio_of = _visual_strehl(
         zernike_um,
         radius_mm=zernike_radius_mm,

@@ -321,7 +321,7 @@ def compute_psf_batch(
         series; "enz_unchecked" does not, for tables that show where the series fails.
     accuracy : {"normal", "fine", "finest"}
         Accuracy of wave-optical PSFs.  The relative L2 error is at most 3e-2 or 1e-2;
-        the share of the light that is displaced is up to 0.012, 0.009 or 0.002.  "enz"
+        the share of the light that is displaced is up to 0.012, 0.009 or 0.004.  "enz"
         is always "fine".
     enz_degree : int
         Largest Zernike degree of the ENZ series; by default the paper's.

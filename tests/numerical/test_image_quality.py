@@ -7,6 +7,7 @@ from scipy import integrate, special
 from estimator import (
     Eye,
     LabeledArray,
+    compute_psf_batch,
     field_table,
     load_profile,
     parse_profile,
@@ -226,6 +227,7 @@ def test_wavefronts_are_those_of_frames(eyes, h_deg):
     )
     nm = [453.0, 536.0, 618.0]
     state = {"pupil_diameter_mm": 4.5, "wavelength_nm": nm, "h_deg": h_deg}
+    given = dict(state)
     found = eyes["keratoconus"].wavefront(
         plane="pupil", focus_dpt=2.5, object_dpt=1.0, **state
     )
@@ -234,6 +236,20 @@ def test_wavefronts_are_those_of_frames(eyes, h_deg):
     total_dpt = optics.total_defocus_dpt(**state, object_dpt=1.0)
     expected = optics.wavefronts(**state, total_defocus_dpt=total_dpt)
     np.testing.assert_allclose(found, expected.zernike_um, atol=3e-3)
+    kernels = eyes["keratoconus"].psf(
+        focus_dpt=2.5, object_dpt=1.0, pixel_arcmin=0.5, **given
+    )
+    of_frames = compute_psf_batch(
+        expected.zernike_um,
+        pupil_diameter_mm=expected.circle_diameter_mm,
+        pupil_ellipse=expected.pupil_ellipse,
+        wavelength_nm=nm,
+        pixel_pitch_mrad=0.5 * pupil_sums.MRAD_PER_ARCMIN,
+        radius_px=kernels.shape[-1] // 2,
+        max_radius_px=1023,
+    )
+    for kernel, psf in zip(kernels.values, of_frames, strict=True):
+        assert moved_light(kernel, psf.kernel) <= 0.015  # they are less accurate
     np.testing.assert_allclose(
         found.coords["zernike_radius_mm"], expected.circle_diameter_mm / 2, atol=1e-3
     )

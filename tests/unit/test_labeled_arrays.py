@@ -259,6 +259,9 @@ def test_lenslets_off_the_axis_and_not_before_the_pupil_are_refused():
     assert np.isfinite(clear.values).all()
     with pytest.raises(ValueError, match="lenslets"):
         eye.mtf(frequency_cpd=[10.0], pupil_diameter_mm=3.0, h_deg=20.0)
+    with pytest.raises(ValueError, match="lenslets"):
+        eye.refraction(method="visual_strehl", pupil_diameter_mm=3.0, h_deg=20.0)
+    assert eye.psf(pupil_diameter_mm=3.0, h_deg=20.0).values.sum() > 0.99
 
 
 def test_the_message_on_other_wavelengths_says_how_to_ask():
