@@ -262,7 +262,9 @@ def optical_transfer(
         pupil_ellipse=pupil_ellipse,
         pupil_screen=pupil_screen,
     )
-    inside = _inside_grid(along_mm, zernike_radius_mm, pupil_ellipse)
+    inside = clear
+    if pupil_screen is not None:
+        inside = _inside_grid(along_mm, zernike_radius_mm, pupil_ellipse)
     if stiles_crawford is not None:
         per_mm2, centre_mm = stiles_crawford.amplitude(np.array([wavelength_nm]))
         x, y = (np.exp(-per_mm2 * (along_mm - at_mm) ** 2) for at_mm in centre_mm[0])
@@ -344,6 +346,9 @@ def white_light_transfer(
             pupil_ellipse=pupil_ellipse,
             pupil_screen=pupil_screen,
         )
+        inside = clear
+        if pupil_screen is not None:
+            inside = _inside_grid(along_mm, radius_mm, pupil_ellipse)
         seen = np.exp(-per_mm2 * along_mm**2)
         clear = clear * (seen[:, None] * seen)
         shifted_um = np.array(zernike_um, dtype=np.float64)
@@ -351,7 +356,6 @@ def white_light_transfer(
         wavefront_um = grid_wavefront_um(shifted_um, along_mm / radius_mm)
         total += weight * _autocorrelation(clear, wavefront_um, at_nm, n_steps)
         pupil_mm2 += weight * _area(clear) * step_mm**2
-        inside = _inside_grid(along_mm, radius_mm, pupil_ellipse)
         within_mm2 += weight * _area_within(clear, inside) * step_mm**2
     return Transfer(
         frequency_cpd=step_cpd * np.arange(-n_steps, n_steps + 1, dtype=np.float64),
