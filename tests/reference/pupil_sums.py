@@ -154,3 +154,22 @@ def moved(image, *, x_px, y_px):
     rows, columns = (np.fft.fftfreq(n) for n in image.shape)
     turn = np.exp(-2j * np.pi * (rows[:, None] * y_px + columns * x_px))
     return np.fft.ifft2(np.fft.fft2(image.astype(np.float64)) * turn).real
+
+
+def isetbio_psf(published):
+    """PSF at the samples of ISETBio: a sum over the pupil points that it uses.
+
+    They are half a step beside the center, 201 across the inverse of an angular step.
+    """
+    count = published.psf.shape[0]
+    side = count // 2
+    mrad = np.arange(-side, side + 1) * published.sample_arcmin * MRAD_PER_ARCMIN
+    step_mm = 0.55 / (count * published.sample_arcmin * MRAD_PER_ARCMIN)
+    along = (np.arange(count) - side + 0.5) * step_mm
+    x, y = np.meshgrid(along, along)
+    wave_um = zernike_sum(np.append(0.0, published.zernike_um), x / 3.0, y / 3.0)
+    is_open = np.hypot(x, y) <= published.pupil_diameter_mm / 2.0
+    field = is_open * np.exp(2j * np.pi / 0.55 * wave_um)
+    turns = np.exp(-2j * np.pi / 0.55 * np.outer(mrad, along))
+    light = np.abs(turns @ field @ turns.T)[::-1] ** 2
+    return light / light.sum()
