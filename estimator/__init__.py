@@ -7,6 +7,7 @@
     wavefront/     ray-traced wavefronts of surfaces
     acuity/        image quality metrics and visual acuity
     dynamics       pupil, accommodation and gaze over time
+    color/         cone signals and CIE XYZ of spectra
     media          scattering and absorption in the ocular media
     psf/           point-spread functions of wavefronts
     corrections/   spectacles, contact lenses and intraocular lenses

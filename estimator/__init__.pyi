@@ -7,6 +7,10 @@ from .acuity.transfer import optical_transfer as optical_transfer
 from .acuity.transfer import perfect_transfer as perfect_transfer
 from .acuity.transfer import white_light_transfer as white_light_transfer
 from .bounded_files import InvalidFile as InvalidFile
+from .color.observers import color_matching as color_matching
+from .color.observers import cone_fundamentals as cone_fundamentals
+from .color.observers import lms_weights as lms_weights
+from .color.observers import xyz_weights as xyz_weights
 from .corrections.progressive import ProgressiveLens as ProgressiveLens
 from .corrections.rings import DiffractiveRings as DiffractiveRings
 from .corrections.rings import Lenslets as Lenslets

@@ -34,8 +34,10 @@ from estimator import WornLens as WornLens
 from estimator import __version__ as __version__
 from estimator import best_correction_um as best_correction_um
 from estimator import chromatic_refraction_dpt as chromatic_refraction_dpt
+from estimator import color_matching as color_matching
 from estimator import compute_psf_batch as compute_psf_batch
 from estimator import compute_psfs as compute_psfs
+from estimator import cone_fundamentals as cone_fundamentals
 from estimator import describe_zernike as describe_zernike
 from estimator import draw_section as draw_section
 from estimator import drawn_biometry as drawn_biometry
@@ -48,6 +50,7 @@ from estimator import draws_periphery as draws_periphery
 from estimator import estimate_eye as estimate_eye
 from estimator import eye_model as eye_model
 from estimator import field_table as field_table
+from estimator import lms_weights as lms_weights
 from estimator import load_profile as load_profile
 from estimator import log_mar_of as log_mar_of
 from estimator import nm_from_index as nm_from_index
@@ -67,6 +70,7 @@ from estimator import rescale_pupil as rescale_pupil
 from estimator import thread_count as thread_count
 from estimator import wavefront_aberrations as wavefront_aberrations
 from estimator import white_light_transfer as white_light_transfer
+from estimator import xyz_weights as xyz_weights
 from estimator import zernike_from as zernike_from
 from estimator import zernike_to as zernike_to
 from estimator import zernike_values as zernike_values

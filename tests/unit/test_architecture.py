@@ -86,6 +86,7 @@ EYE_ROOMS = {
     "psf": ("native", "optics"),
     "corrections": ("wavefront", "optics"),
     "media": (),
+    "color": (),
     "acuity": ("psf", "optics"),
     "dynamics": (),
     "eye": ("corrections", "wavefront", "optics"),
