@@ -14,6 +14,8 @@ from .errors import BadMessage as BadMessage
 from .errors import FilterError as FilterError
 from .filter_protocol import Filter as Filter
 from .filter_protocol import FilteredImages as FilteredImages
+from .filtering.band_filter import BandFilter as BandFilter
+from .filtering.band_filter import FilteredBands as FilteredBands
 from .filtering.derivatives import image_derivatives as image_derivatives
 from .filtering.eye_filter import EyeFilter as EyeFilter
 from .filtering.operator import FilterOperator as FilterOperator

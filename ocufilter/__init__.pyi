@@ -76,6 +76,7 @@ from estimator import zernike_to as zernike_to
 from estimator import zernike_values as zernike_values
 from filter_service import Accumulation as Accumulation
 from filter_service import BadMessage as BadMessage
+from filter_service import BandFilter as BandFilter
 from filter_service import BestLens as BestLens
 from filter_service import BuildingEye as BuildingEye
 from filter_service import Camera as Camera
@@ -87,6 +88,7 @@ from filter_service import EyeFilter as EyeFilter
 from filter_service import EyeReady as EyeReady
 from filter_service import Filter as Filter
 from filter_service import Filtered as Filtered
+from filter_service import FilteredBands as FilteredBands
 from filter_service import FilteredImages as FilteredImages
 from filter_service import FilterError as FilterError
 from filter_service import FilterOperator as FilterOperator

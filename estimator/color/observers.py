@@ -230,8 +230,8 @@ def lms_weights(
     -------
     (n, 3)
         Integrals of the fundamentals, for spectra that are linear between bands and end
-        at the first and the last.  A spectrum of 1 has the signal 1 if the bands
-        include the visible wavelengths.
+        at the first and the last.  A spectrum of 1 over the visible wavelengths has
+        the signal 1 at every age: the cones are adapted to it.
 
     Raises
     ------

@@ -6,6 +6,7 @@ replaces the previous one.  A *store* is the PSF cache of one eye for one camera
 *builder* advances the builds of all streams of a process.
 
 eye_filter        `EyeFilter`: one stream
+band_filter       `BandFilter`: images of many wavelengths
 operator          `FilterOperator`: the filter of a frame as a matrix
 derivatives       derivatives of images by parameters of state and profile
 planned_frame     a frame whose eyes are prepared, and `Filtered`

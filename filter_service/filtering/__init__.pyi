@@ -1,3 +1,5 @@
+from .band_filter import BandFilter as BandFilter
+from .band_filter import FilteredBands as FilteredBands
 from .builder import Builder as Builder
 from .derivatives import image_derivatives as image_derivatives
 from .eye_filter import EyeFilter as EyeFilter
