@@ -33,6 +33,7 @@ Importing this package loads no submodules, which keeps clients light.
     serve            `ocufilter serve`
     version          version of the installed package
     one_blas_thread  NumPy's BLAS on one thread
+    blas_threads     the same for a while
     gl/              OpenGL context and shaders
     native/          compiled loops in C
     planning/        PSFs that an eye needs for a given error

@@ -122,8 +122,8 @@ class Focusing(ABC):
         """Return smallest and largest accommodation over ranges of focus and pupil."""
         used_dpt = [
             self.accommodation_dpt(focus_dpt, pupil_diameter_mm=float(pupil_mm))
-            for pupil_mm in np.linspace(*pupil_range_mm, RANGE_PUPIL_COUNT)
-            for focus_dpt in focus_range_dpt
+            for pupil_mm in np.unique(np.linspace(*pupil_range_mm, RANGE_PUPIL_COUNT))
+            for focus_dpt in np.unique(focus_range_dpt).tolist()
         ]
         return min(used_dpt), max(used_dpt)
 

@@ -18,6 +18,7 @@ from multiprocessing.connection import wait
 from typing import Any
 
 from estimator.profiles.parse import EyeProfile
+from filter_service.blas_threads import one_blas_thread
 from filter_service.building.jobs import (
     BuildDone,
     BuildError,
@@ -228,10 +229,11 @@ class Builder:
         Without a thread, this prepares eyes for a moment.
         """
         if not self.worker.has_process:
-            work, has_more = self._step()
-            if work is not None:
-                work.compute(self._lock, lambda: False)
-                self._next_work()
+            with one_blas_thread():
+                work, has_more = self._step()
+                if work is not None:
+                    work.compute(self._lock, lambda: False)
+                    self._next_work()
             if has_more:
                 timeout_s = 0.0
         self.deliver(stream, timeout_s)

@@ -100,13 +100,16 @@ class EyeFilter:
     gl_context : "own" or "current"
         OpenGL context of the engine gl: one of its own, or the one that is current now,
         as `filter_textures` requires.  The latter must be current for every call.
+    worker : bool
+        Whether a process of its own estimates eyes.  Without one, calls that wait for
+        an eye estimate it, which takes less processor time if each eye has few images.
 
     Raises
     ------
     ValueError
         If the profile is invalid; the message names the field.
     RenderError
-        If no engine works on this machine; the message names what to install.
+        If no engine works on this machine.
     """
 
     def __init__(
@@ -121,6 +124,7 @@ class EyeFilter:
         first_generation: int = 1,
         engine: Engine = "auto",
         gl_context: Literal["own", "current"] = "own",
+        worker: bool = True,
     ) -> None:
         first = None if profile is None else as_profile(profile)
         self.cameras = as_cameras(camera)
@@ -131,7 +135,7 @@ class EyeFilter:
         self._takes_textures = builder is not None or gl_context == "current"
         if builder is None:
             with self._new_wait("Opening the filter"):
-                builder, self._shared = acquired(engine, gl_context)
+                builder, self._shared = acquired(engine, gl_context, worker=worker)
         self._builder: Builder | None = builder
         self._eyes = StreamEyes(
             self._handle_event,
@@ -238,8 +242,7 @@ class EyeFilter:
         Parameters
         ----------
         timeout_s : float
-            Longest time in which neither the build of an eye nor the computation of its
-            PSFs advances.
+            As for `filter`.
 
         Raises
         ------
@@ -475,9 +478,8 @@ class EyeFilter:
 
         On a hardware GPU, the CPU is free until then: to render, to begin the frame of
         the other eye, or to begin the next frame, whose images are copied while the GPU
-        filters this one.  Other engines filter the frame at once.
-
-        The parameters and errors are the same as for `try_filter`, which waits.
+        filters this one.  Other engines filter the frame at once.  The parameters and
+        errors are the same as for `try_filter`, which waits.
 
         Returns
         -------
@@ -573,10 +575,9 @@ class EyeFilter:
     ) -> PlannedFrame | Preparing:
         """Return a frame that is ready to be rendered, or `Preparing`.
 
-        All states have the same pupil and focus.  The errors are the same as for
-        `try_filter`.  To prepare two eyes at the same time, plan the frames of both
-        before you render one.  Render a plan before the next call of this filter, which
-        may free the plan's stores.
+        All states have the same pupil and focus.  Errors are those of `try_filter`.
+        To prepare two eyes at the same time, plan the frames of both before you render
+        one.  Render a plan before the next call, which may free the plan's stores.
         """
         arrays = [view for view in views if isinstance(view, RgbdView)]
         if arrays:

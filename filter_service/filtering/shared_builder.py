@@ -181,10 +181,15 @@ class SharedBuilder:
     engine : str
     context : int
         Address of the caller's context that it belongs to; 0 for an own one.
+    has_worker : bool
+        Whether a worker process estimates eyes, or the thread that waits for them.
     """
 
-    def __init__(self, engine: str, context: int = 0) -> None:
+    def __init__(
+        self, engine: str, context: int = 0, *, has_worker: bool = True
+    ) -> None:
         self._engine, self.context = engine, context
+        self._has_worker = has_worker
         self._builder: Builder | None = None
         self._closing = ExitStack()
         self._n_users = 0
@@ -194,11 +199,10 @@ class SharedBuilder:
         """Return the builder and add a reference; the first reference opens it."""
         if self._builder is None:
             limits = BuildLimits(store_cache_dir=default_cache_dir())
+            worker = WorkerHandle() if self._has_worker else InlineWorker()
             with ExitStack() as closing:
                 self._builder = open_builder(
-                    *(WorkerHandle(), limits, closing),
-                    engine=self._engine,
-                    current=current,
+                    *(worker, limits, closing), engine=self._engine, current=current
                 )
                 self._closing.push(closing.pop_all())
             preload()  # while the worker estimates the first eye
@@ -221,20 +225,22 @@ _opened: list[SharedBuilder] = []
 
 
 @cache
-def shared(engine: str, context: int = 0) -> SharedBuilder:
+def shared(engine: str, context: int = 0, *, has_worker: bool = True) -> SharedBuilder:
     """Return the shared builder of an engine setting and a context of the caller."""
-    _opened.append(SharedBuilder(engine, context))
+    _opened.append(SharedBuilder(engine, context, has_worker=has_worker))
     return _opened[-1]
 
 
-def acquired(engine: Engine, gl_context: str) -> tuple[Builder, SharedBuilder]:
+def acquired(
+    engine: Engine, gl_context: str, *, worker: bool = True
+) -> tuple[Builder, SharedBuilder]:
     """Return the shared builder of an engine and a context, with a reference."""
     if gl_context not in GL_CONTEXTS:
         raise BadMessage(
             f"{gl_context!r}", field="gl_context", allowed=" or ".join(GL_CONTEXTS)
         )
     if gl_context == "own":
-        found = shared(engine)
+        found = shared(engine, has_worker=worker)
         return found.acquire(), found
     if engine == "native":
         raise BadMessage(
@@ -243,7 +249,7 @@ def acquired(engine: Engine, gl_context: str) -> tuple[Builder, SharedBuilder]:
     from filter_service.gl.current_context import CurrentContext
 
     current = CurrentContext()
-    found = shared("gl", current.handle)
+    found = shared("gl", current.handle, has_worker=worker)
     return found.acquire(current), found
 
 

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.field.eye_optics import EyeOptics
+from estimator.wavefront.field_wavefronts import distinct_rows
 from filter_service.planning.grid import MAX_FIELD_DEG, GridSpec, field_deg
 from filter_service.planning.node_wavefronts import (
     WEIGHTS,
@@ -255,13 +256,16 @@ def sample_states(eye: EyeOptics, spec: GridSpec, count: int) -> StateSample:
         spec.settings.focus_range_dpt[0] + np.ptp(spec.settings.focus_range_dpt) * focus
     )
     pupils_mm = low_mm + (high_mm - low_mm) * pupil
+    first, number = distinct_rows(foci_dpt, pupils_mm)  # one, if no range is wide
     accommodations_dpt, focused_dpt = (
         np.array(
             [
                 evaluate(focus_dpt, pupil_diameter_mm=pupil_mm)
-                for focus_dpt, pupil_mm in zip(foci_dpt, pupils_mm, strict=True)
+                for focus_dpt, pupil_mm in zip(
+                    foci_dpt[first], pupils_mm[first], strict=True
+                )
             ]
-        )
+        )[number]
         for evaluate in (eye.accommodation_dpt, eye.reachable_focus_dpt)
     )
     vergence_dpt = eye.vergence.vergence_dpt(
