@@ -14,7 +14,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -78,7 +78,8 @@ MAX_MISFIT_UM = 0.1
 """Largest RMS misfit of measurements that is not reported."""
 
 
-class OffMeridianDraw(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class OffMeridianDraw:
     """A function drawn from the Gaussian process, as a sum of random cosines.
 
     Attributes

@@ -94,7 +94,7 @@ def _packed(
         return {"note": [value.code, str(value), value.values]}
     if isinstance(value, _PLAIN):
         return value
-    if isinstance(value, list | tuple):
+    if type(value) in (list, tuple):  # named tuples would come back as plain ones
         items = [
             _packed(item, f"{path}.{i}", arrays, known) for i, item in enumerate(value)
         ]

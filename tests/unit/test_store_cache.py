@@ -23,6 +23,8 @@ from filter_service.errors import BuildCancelled
 from filter_service.messages import Camera
 from filter_service.planning.plan import plan_cache
 from filter_service.psfs import store_cache, store_file
+from filter_service.psfs.eye_for_spec import eye_for_spec
+from filter_service.psfs.pack import StoreTables
 from filter_service.psfs.store import PsfStore
 from filter_service.psfs.store_cache import (
     StoreCache,
@@ -113,6 +115,28 @@ def test_a_store_comes_back_whole_and_its_eye_answers_the_same(cache, stored, pa
         stored.parts["eye"].total_defocus_dpt(**state), abs=0
     )
     assert cache.load(key_of(2), check_cancelled=nothing) is None
+
+
+@pytest.mark.long("a drawn eye is estimated and traced over the field")
+def test_a_drawn_eye_comes_back_with_its_periphery(cache):
+    spec = SPEC.with_settings(mode="dynamic")
+    eye, notes = eye_for_spec(replace(PROFILE, sample=3), spec)
+    cache.save(key_of(1), Stored({"eye": eye}, notes))
+    again = cache.load(key_of(1), check_cancelled=nothing).parts["eye"]
+    state = {"pupil_diameter_mm": 4.0, "accommodation_dpt": 0.0, "wavelength_nm": 536.0}
+    h_deg = np.linspace(-20.0, 20.0, 5)
+    assert eye.periphery.change.off_meridian_draw is not None
+    np.testing.assert_array_equal(
+        again.total_defocus_dpt(h_deg=h_deg, v_deg=5.0, **state),
+        eye.total_defocus_dpt(h_deg=h_deg, v_deg=5.0, **state),
+    )
+
+
+def test_a_named_tuple_is_not_stored_as_a_plain_one():
+    named = store_file.pack({"tables": StoreTables.empty()._asdict()})
+    assert len(named[1]) == len(StoreTables._fields)
+    with pytest.raises(store_file.NotStorable, match="tables is a StoreTables"):
+        store_file.pack({"tables": StoreTables.empty()})
 
 
 def test_the_folder_is_for_its_owner_only_and_holds_no_pickle(path):
