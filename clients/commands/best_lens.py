@@ -304,9 +304,11 @@ def _text(trial: "LensTrial") -> str:
 def _report(found: "BestLens", notes: list[str]) -> None:
     for note in notes:
         print_line(f"note: {note}")
+    vertex_mm = found.best.prescription.vertex_mm
+    place = f"{vertex_mm:g} mm before the cornea" if vertex_mm else "at the cornea"
     print_line(
-        f"best lens {_text(found.best)}, {found.best.prescription.vertex_mm:g} mm "
-        f"before the cornea: error lower by {found.gain_db:.1f} dB than without it"
+        f"best lens {_text(found.best)}, {place}: error lower by {found.gain_db:.1f} "
+        "dB than without it"
     )
     print_line(
         f"rounded {_text(found.rounded)}: error higher by "

@@ -255,7 +255,10 @@ def best_lens(
             if on_progress is not None:
                 on_progress(fraction, stage)
 
-        return search.run(max_evaluations, report, begin_s)
+        found = search.run(max_evaluations, report, begin_s)
+    if on_progress is not None:
+        on_progress(1.0, "lenses")
+    return found
 
 
 class _Search:
@@ -288,8 +291,6 @@ class _Search:
         self, max_evaluations: int, report: Callable[[str], None], begin_s: float
     ) -> BestLens:
         """Return the best lens."""
-        from scipy.optimize import Bounds, minimize  # loads slowly
-
         report("targets")
         for sight in self._sights:
             target = linear_light(sight.scene.view)
@@ -300,38 +301,7 @@ class _Search:
         error_before_db, before = self._error_db(images), images[0]
         notes = [*dict.fromkeys(note for note in notes if not _is_of_focus(note))]
         report("start")
-        first = self._start()
-        n_powers = 3 if self._has_cylinder else 1
-
-        def error_db(x: NDArray[np.float64]) -> float:
-            trial = self._try(x)
-            report("lenses")
-            return trial.error_db
-
-        x0 = np.array(first[:n_powers])
-        if self._is_progressive:
-            x0 = np.append(x0, self._first_add_dpt())
-        scanned = []
-        for sphere_dpt in sorted(self._scan_dpt(), key=abs):
-            x = x0.copy()
-            x[0] += sphere_dpt
-            scanned.append((error_db(x), x))
-        start = self.trials[0]
-        _, x1 = min(scanned, key=lambda each: each[0])
-        lows, highs = np.full(x0.size, -BOUND_DPT), np.full(x0.size, BOUND_DPT)
-        if self._is_progressive:
-            lows[-1], highs[-1] = ADD_LIMITS_DPT
-        found = minimize(
-            error_db,
-            x1,
-            method="COBYQA",
-            bounds=Bounds(lows, highs),
-            options={
-                "initial_tr_radius": FIRST_RADIUS_DPT,
-                "final_tr_radius": LAST_RADIUS_DPT,
-                "maxfev": max_evaluations - len(self.trials),
-            },
-        )
+        has_converged = self._minimize(max_evaluations, report)
         best = min(self.trials, key=lambda trial: trial.error_db)
         rounded = rounded_prescription(best.prescription)
         add_dpt = best.add_dpt and _in_steps(best.add_dpt, POWER_STEP_DPT)
@@ -344,7 +314,7 @@ class _Search:
         return BestLens(
             best=best,
             rounded=LensTrial(rounded, add_dpt, self._error_db(rounded_images)),
-            start=start,
+            start=self.trials[0],
             error_before_db=error_before_db,
             trials=tuple(self.trials),
             correction=body,
@@ -352,10 +322,46 @@ class _Search:
             before=before,
             after=after[0],
             target=self._sights[0].target,
-            has_converged=bool(found.success),
+            has_converged=has_converged,
             search_s=search_s,
             notes=tuple(notes),
         )
+
+    def _minimize(self, max_evaluations: int, report: Callable[[str], None]) -> bool:
+        """Try lenses, the start first; return whether the search converged."""
+        from scipy.optimize import Bounds, minimize  # loads slowly
+
+        def error_db(x: NDArray[np.float64]) -> float:
+            trial = self._try(x)
+            report("lenses")
+            return trial.error_db
+
+        x0 = np.array(self._start()[: 3 if self._has_cylinder else 1])
+        lows, highs = np.full(x0.size, -BOUND_DPT), np.full(x0.size, BOUND_DPT)
+        if self._is_progressive:
+            x0 = np.append(x0, self._first_add_dpt())
+            lows, highs = (
+                np.append(bounds, add_dpt)
+                for bounds, add_dpt in zip((lows, highs), ADD_LIMITS_DPT, strict=True)
+            )
+        scanned = []
+        for sphere_dpt in sorted(self._scan_dpt(), key=abs):
+            x = x0.copy()
+            x[0] += sphere_dpt
+            scanned.append((error_db(x), x))
+        _, x1 = min(scanned, key=lambda each: each[0])
+        found = minimize(
+            error_db,
+            x1,
+            method="COBYQA",
+            bounds=Bounds(lows, highs),
+            options={
+                "initial_tr_radius": FIRST_RADIUS_DPT,
+                "final_tr_radius": LAST_RADIUS_DPT,
+                "maxfev": max_evaluations - len(self.trials),
+            },
+        )
+        return bool(found.success)
 
     def _start(self) -> tuple[float, float, float]:
         """Return the power vector, at the pupil, with the highest visual Strehl."""
