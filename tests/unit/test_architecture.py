@@ -75,7 +75,9 @@ SCENES_IN_EXAMPLES = (
 )
 """Modules of scenes, which docs/how-to/pyrender.md describes."""
 
-EXAMPLES_IMPORT = {"trimesh", "numpy", "PIL", "matplotlib", "common"}
+EXAMPLES_IMPORT = {
+    *("trimesh", "numpy", "scipy", "PIL", "matplotlib", "torch", "common"),
+}
 """Besides the standard library and the public names."""
 
 EYE_ROOMS = {
@@ -251,6 +253,7 @@ def test_examples_use_what_the_face_shows_and_nothing_else():
         for path in scripts
         for entry in imports_of(path)
         if entry.module not in face
+        and not _may(entry.module, ("ocufilter.torch",))
         and not _may(entry.module, SCENES_IN_EXAMPLES)
         and entry.top not in {*EXAMPLES_IMPORT, *sys.stdlib_module_names}
     ]
