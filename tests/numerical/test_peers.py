@@ -14,6 +14,7 @@ from tests.benchmarks.bench_peers import (
     PEERS,
     THIN_LENSES,
     flat_rows,
+    gradient_rows,
     line_of,
     measured,
     our_peers,
@@ -163,6 +164,26 @@ def test_ours_is_measured_where_the_other_side_is_missing(
     assert all(row.error > 40.0 and row.other_error is None for row in ours)
     missing = {row.missing for row in rows if row not in ours}
     assert missing == {"optiland (sh setup.sh peers)"}
+
+
+GRADIENT_ERRORS = {
+    "ours, normal": 0.01,
+    "ours, fine": 0.001,
+    "optiland FFTPSF": 0.001,
+    "DeepLens GeoLens": 0.03,  # random rays
+}
+
+
+def test_gradients_of_defocus_are_those_of_quadrature():
+    rows = {row.method: row for row in gradient_rows()}
+    assert set(rows) == set(GRADIENT_ERRORS)
+    for name, row in rows.items():
+        if row.missing is not None:
+            assert not name.startswith("ours")
+            assert f"not installed: {row.missing}" in line_of(row)
+            continue
+        assert 0.0 < row.error < GRADIENT_ERRORS[name]
+        assert row.min_ms > 0.0
 
 
 def test_what_a_state_needs_is_made_when_the_state_is_new(problem):

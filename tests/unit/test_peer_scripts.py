@@ -8,7 +8,7 @@ from scipy.signal import fftconvolve
 
 from estimator.profiles.parse import parse_profile
 from filter_service.planning.grid import pixel_from_mrad
-from tests.benchmarks import peer_process
+from tests.benchmarks import peer_gradients, peer_process
 from tests.benchmarks.bench_peers import line_of, printed_rows
 from tests.benchmarks.peer_deeplens_script import (
     kernel_side_px,
@@ -29,6 +29,7 @@ from tests.benchmarks.peer_optiland_script import (
     hat,
     integrated,
     local_scale,
+    pixel_weights,
 )
 from tests.benchmarks.peer_problem import NotInstalled
 from tests.grid_specs import grid_spec
@@ -215,3 +216,32 @@ def test_a_missing_environment_is_named_with_the_command_that_makes_it(
     monkeypatch.setattr(peer_process, "PYTHON", tmp_path / "python")
     with pytest.raises(NotInstalled, match=r"^optiland \(sh setup.sh peers\)$"):
         peer_process.require("optiland")
+
+
+def test_rays_meet_behind_the_ellipsoid_that_focuses_them(monkeypatch):
+    """A conic constant of -1 / n^2 focuses parallel rays at n R / (n - 1)."""
+    index, radius_mm = 1.336, 7.8
+    surface = {
+        "radius_mm": radius_mm,
+        "conic_constant": -1.0 / index**2,
+        "z_mm": 0.0,
+        "index_after": index,
+    }
+    heights_mm = np.linspace(0.1, 3.0, 7)
+    focus_mm = index * radius_mm / (index - 1.0)
+    monkeypatch.setattr(peer_gradients, "RETINA_MM", focus_mm)
+    assert peer_gradients.traced_heights([surface], heights_mm) == pytest.approx(
+        np.zeros(7), abs=1e-12
+    )
+    monkeypatch.setattr(peer_gradients, "RETINA_MM", 0.5 * focus_mm)
+    found = peer_gradients.traced_heights([surface], np.array([1e-4]))
+    assert found == pytest.approx([0.5e-4], rel=1e-6)
+
+
+def test_samples_of_a_psf_are_weighted_with_the_blob_of_their_pixels():
+    blob = np.array([1.0, 3.0, 2.0])
+    weights = pixel_weights(blob, pitch=2.0, step=0.5, size=16)
+    assert weights.sum() * 0.5 == pytest.approx(blob.sum() * 2.0)
+    assert weights[8] == pytest.approx(3.0)  # the sample on the axis
+    assert weights[6] == pytest.approx((1.0 + 3.0) / 2.0)  # at the edge of a pixel
+    assert weights[[0, 15]] == pytest.approx([0.0, 0.0])
