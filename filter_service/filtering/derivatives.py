@@ -93,7 +93,9 @@ def image_derivatives(
     With the accuracy "normal", the amplitudes of derivatives have errors of up to 1 %,
     single pixels of 0.3 to 3 %, those by gaze up to twice that: PSFs have errors that
     change with the state.  With "fine", most errors are below 0.1 %, but each PSF takes
-    0.1 to 1 s; there is one for each color, distance and direction of the field.
+    20 to 500 ms; there is one for each color, distance and direction of the field.
+    Within a few pixels of an edge of depth, the image has kinks as a function of the
+    state, and derivatives depend on the step.
 
     Parameters
     ----------
