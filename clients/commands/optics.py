@@ -393,10 +393,10 @@ def psf(
     wavefront.  Off the axis, it is based on the most probable wavefront of people with
     the same wavefront on the axis.
 
-    A LIST is numbers separated by commas, or first:last:step.  Of lists, all
-    combinations are computed by wave optics and printed as a table; -o writes one array
-    with an axis for each list, in the order pupil, focus, object, wavelength after
-    azimuth and elevation, or a figure of all PSFs.
+    A LIST is numbers separated by commas, or first:last:step.  If an option has several
+    numbers, all combinations are computed by wave optics, and a table is printed.  -o
+    then writes a figure of all PSFs, or an array with an axis for each such list, in
+    the order azimuth, elevation, pupil, focus, object, wavelength, before y and x.
 
     ocufilter psf keratoconus --pupil-mm 5 --wavelength-nm 549
     --pixel-arcmin 1 --h-deg 20 -o psf.png
