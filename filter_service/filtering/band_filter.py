@@ -274,7 +274,8 @@ class BandFilter:
                 timeout_s=timeout_s,
                 **options,
             )
-            seen[..., group.bands] = frame.color[..., group.channels]
+            for band, channel in zip(group.bands, group.channels, strict=True):
+                seen[..., band] = frame.color[..., channel]
             found.append(frame)
         return FilteredBands(
             seen, self.wavelengths_nm, tuple(found), self._lens_age_years
@@ -309,7 +310,10 @@ class BandGroup:
         bands = [self.bands[0]] * RGB
         for band, channel in zip(self.bands, self.channels, strict=True):
             bands[channel] = band
-        return np.ascontiguousarray(image[..., bands])
+        color = np.empty((*image.shape[:2], RGB), image.dtype)
+        for channel, band in enumerate(bands):  # faster than image[..., bands]
+            color[..., channel] = image[..., band]
+        return color
 
 
 def band_groups(
