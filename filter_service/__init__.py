@@ -10,6 +10,7 @@ Importing this package loads no submodules, which keeps clients light.
     texture_view     the same in textures of the caller
     filter_protocol  common protocol of `EyeFilter` and `clients.FilterClient`
     view_state       state of an eye; eye and state of a view
+    given_profile    profiles as programs give them
     stage_times      times of a frame's stages
     messages         types of the wire protocol (PROTOCOL.md)
     protocol_schema  JSON Schema of the message headers

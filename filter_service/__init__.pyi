@@ -1,3 +1,5 @@
+from .building.eye_bank import BankedEye as BankedEye
+from .building.eye_bank import EyeBank as EyeBank
 from .camera import Camera as Camera
 from .camera import tangents_from_fov as tangents_from_fov
 from .correcting.correction import Correction as Correction

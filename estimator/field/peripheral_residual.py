@@ -110,10 +110,30 @@ class PeripheralResidual:
             found_um = self._difference_um(self._traced, h_deg, v_deg)
             found_um = found_um - self._on_axis_um
             found_um.flags.writeable = False
-            # A new dict, because other threads may read the old one.
-            known = [*self._known_um.items(), (key, found_um)]
-            self._known_um = dict(known[-MAX_KNOWN:])
+            self.keep(h_deg, v_deg, found_um)
         return found_um
+
+    def keep(
+        self,
+        h_deg: NDArray[np.float64],
+        v_deg: NDArray[np.float64],
+        phase_um: NDArray[np.float64],
+    ) -> None:
+        """Keep a result of `at`, which was computed before, for these fields."""
+        # A new dict, because other threads may read the old one.
+        known = [
+            *self._known_um.items(),
+            ((h_deg.tobytes(), v_deg.tobytes()), phase_um),
+        ]
+        self._known_um = dict(known[-MAX_KNOWN:])
+
+    def last_known(self) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]] | None:
+        """Return the arguments of `keep` for the last fields, or None."""
+        if not self._known_um:
+            return None
+        key, phase_um = next(reversed(self._known_um.items()))
+        h_deg, v_deg = (np.frombuffer(own, np.float64) for own in key)
+        return h_deg, v_deg, phase_um
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the state without known phases, which take a megabyte."""

@@ -6,6 +6,7 @@ the nodes (states of pupil and focus, field directions, defocus) of its PSFs.  A
 
 jobs                requests, limits and results of the worker
 from_profile        the build itself
+eye_bank            prebuilt eyes on disk
 worker              main program of the worker process
 worker_handle       starts the process, queues builds, recovers from crashes
 """

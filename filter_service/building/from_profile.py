@@ -8,6 +8,7 @@ from itertools import islice
 
 from estimator.eye.checked_fields import ProfileError
 from estimator.note import Note
+from filter_service.building.eye_bank import BankedEye
 from filter_service.building.jobs import BuildJob, BuiltStore, unknown_profile
 from filter_service.errors import (
     BuildCancelled,
@@ -70,6 +71,9 @@ def _built(
     job: BuildJob, progress: Progress, cancelled: Callable[[], bool]
 ) -> BuiltStore:
     profile, spec = job.profile, grid_spec(job)
+    if isinstance(profile, BankedEye):
+        banked = profile.store(spec)
+        return BuiltStore(banked, banked.notes)
     cache = StoreCache(job.limits.store_cache_dir, max_mb=job.limits.store_cache_max_mb)
     key = store_key(profile, spec)
 

@@ -29,7 +29,8 @@ from filter_service.correcting.solver import (
 from filter_service.errors import BadMessage
 from filter_service.filtering.builder import Builder
 from filter_service.filtering.eye_filter import EyeFilter
-from filter_service.filtering.stream_eyes import BuildingEye, EyeEvent, Profile
+from filter_service.filtering.stream_eyes import BuildingEye, EyeEvent
+from filter_service.given_profile import Profile
 from filter_service.rendering.frame import object_range_dpt
 from filter_service.rgbd_view import MIN_DEPTH_M, RgbdView
 from filter_service.settings import (

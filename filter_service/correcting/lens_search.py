@@ -45,7 +45,7 @@ from filter_service.errors import BadMessage
 from filter_service.filtering.builder import Builder
 from filter_service.filtering.eye_filter import EyeFilter
 from filter_service.filtering.shared_builder import open_inline_builder
-from filter_service.filtering.stream_eyes import Profile, as_profile
+from filter_service.given_profile import Profile, as_profile
 from filter_service.settings import DEFAULTS, FilterSettings, as_settings
 from filter_service.waiting import Wait
 

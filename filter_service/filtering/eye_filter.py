@@ -41,10 +41,9 @@ from filter_service.filtering.stream_eyes import (
     EyeReady,
     PreparedStore,
     Preparing,
-    Profile,
     StreamEyes,
-    as_profile,
 )
+from filter_service.given_profile import Profile, as_profile
 from filter_service.rgbd_view import ColorImage, RgbdView, as_cameras, as_views
 from filter_service.settings import (
     DEFAULTS,

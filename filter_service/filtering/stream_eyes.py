@@ -7,15 +7,13 @@ A profile is requested, then building, then ready.  This module only holds the s
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from queue import SimpleQueue
 from typing import Any, Literal, NamedTuple
 from weakref import WeakSet
 
-from estimator.profiles.files import load_profile
-from estimator.profiles.parse import EyeProfile, parse_profile
+from estimator.profiles.parse import EyeProfile
 from filter_service.camera import Camera, distinct_cameras, is_same_camera
 from filter_service.errors import FilterError, NoProfile
 from filter_service.filtering.frame_history import FrameHistory
@@ -23,24 +21,6 @@ from filter_service.filtering.psf_work import PredictedNodes, PsfWork
 from filter_service.rendering.frame_states import FrameStore
 from filter_service.rendering.media_effects import MediaEffects
 from filter_service.settings import FilterSettings
-
-Profile = EyeProfile | Mapping[str, Any] | str | Path
-
-
-def as_profile(profile: Profile) -> EyeProfile:
-    """Return a parsed profile, given as one, as a mapping, a preset's name or a file.
-
-    Raises
-    ------
-    ValueError
-        If the profile is invalid; the message names the field, the value and the
-        allowed values.
-    """
-    if isinstance(profile, Mapping):
-        return parse_profile(profile)
-    if isinstance(profile, str | Path):
-        return load_profile(str(profile))
-    return profile
 
 
 @dataclass(eq=False)

@@ -14,6 +14,7 @@ from __future__ import annotations
 import importlib
 import json
 import math
+import mmap
 import os
 import stat
 import struct
@@ -21,6 +22,7 @@ import tempfile
 import zlib
 from collections.abc import Callable, Iterator, Mapping
 from functools import cached_property
+from io import FileIO
 from pathlib import Path
 from typing import Any
 
@@ -94,7 +96,8 @@ def _packed(
         return {"note": [value.code, str(value), value.values]}
     if isinstance(value, _PLAIN):
         return value
-    if type(value) in (list, tuple):  # named tuples would come back as plain ones
+    # Named tuples would come back as plain ones.
+    if isinstance(value, list | tuple) and type(value) in (list, tuple):
         items = [
             _packed(item, f"{path}.{i}", arrays, known) for i, item in enumerate(value)
         ]
@@ -236,22 +239,7 @@ def read_file(path: Path, *, check_cancelled: CheckCancelled = lambda: None) -> 
         If the file cannot be read or does not exist.
     """
     with open(path, "rb", buffering=0, opener=_open_plain_file) as file:
-        preamble = file.read(PREAMBLE.size)
-        if len(preamble) < PREAMBLE.size:
-            raise DamagedFile("the preamble is truncated")
-        magic, n_header, start, n_bytes, header_sum, data_sum = PREAMBLE.unpack(
-            preamble
-        )
-        n_there = os.fstat(file.fileno()).st_size
-        if magic != MAGIC or not PREAMBLE.size + n_header <= start <= n_there:
-            raise DamagedFile("the preamble is invalid")
-        if n_there != start + n_bytes:
-            raise DamagedFile(
-                f"the file has {n_there} bytes, expected {start + n_bytes}"
-            )
-        header = file.read(n_header)
-        if zlib.crc32(header) != header_sum:
-            raise DamagedFile("the checksum of the header is wrong")
+        header, start, n_bytes, data_sum = _header(file)
         file.seek(start)
         data, checksum = np.empty(n_bytes, np.uint8), 0
         for first in range(0, n_bytes, BLOCK_BYTES):
@@ -262,6 +250,55 @@ def read_file(path: Path, *, check_cancelled: CheckCancelled = lambda: None) -> 
             check_cancelled()
     if checksum != data_sum:
         raise DamagedFile("the checksum of the arrays is wrong")
+    return _object(header, data)
+
+
+def map_file(path: Path, *, verify: bool = True) -> Any:
+    """Return the object of a file, with read-only arrays that are mapped, not read.
+
+    Processes that map the same file share its memory.  A file that is replaced does not
+    affect the maps of the old one.
+
+    Parameters
+    ----------
+    verify : bool
+        Whether to compare the checksum of the arrays, which reads all of them.
+
+    Raises
+    ------
+    DamagedFile, OSError
+        As `read_file`.
+    """
+    with open(path, "rb", buffering=0, opener=_open_plain_file) as file:
+        header, start, n_bytes, data_sum = _header(file)
+        data: NDArray[np.uint8] = np.zeros(0, np.uint8)
+        if n_bytes:
+            mapped = mmap.mmap(file.fileno(), start + n_bytes, access=mmap.ACCESS_READ)
+            data = np.frombuffer(mapped, np.uint8, n_bytes, start)
+    if verify and zlib.crc32(data.data) != data_sum:
+        raise DamagedFile("the checksum of the arrays is wrong")
+    return _object(header, data)
+
+
+def _header(file: FileIO) -> tuple[bytes, int, int, int]:
+    """Return the header, the start and size of the arrays, and their checksum."""
+    preamble = file.read(PREAMBLE.size)
+    if len(preamble) < PREAMBLE.size:
+        raise DamagedFile("the preamble is truncated")
+    magic, n_header, start, n_bytes, header_sum, data_sum = PREAMBLE.unpack(preamble)
+    n_there = os.fstat(file.fileno()).st_size
+    if magic != MAGIC or not PREAMBLE.size + n_header <= start <= n_there:
+        raise DamagedFile("the preamble is invalid")
+    if n_there != start + n_bytes:
+        raise DamagedFile(f"the file has {n_there} bytes, expected {start + n_bytes}")
+    header = file.read(n_header)
+    if zlib.crc32(header) != header_sum:
+        raise DamagedFile("the checksum of the header is wrong")
+    return header, start, n_bytes, data_sum
+
+
+def _object(header: bytes, data: NDArray[np.uint8]) -> Any:
+    """Return the object of a header and its arrays."""
     try:
         content = json.loads(header)
         arrays = {key: _array(data, p) for key, p in content["arrays"].items()}

@@ -15,7 +15,7 @@ from estimator.field.eye_optics import EyeOptics
 from estimator.optics import pinhole
 from filter_service.camera import Camera
 from filter_service.filtering.eye_filter import EyeFilter
-from filter_service.filtering.stream_eyes import as_profile
+from filter_service.given_profile import as_profile
 from filter_service.rgbd_view import RgbdView
 from filter_service.settings import FilterSettings
 from tests.benchmarks.harness import OUT
