@@ -340,7 +340,7 @@ def _covariance_root(population: Population) -> NDArray[np.float64]:
     """Return a root (n, n) of the covariance of a population, which takes 2 ms."""
     scale = population.deviation_um.ravel()
     covariance = population.correlation_ratio * np.outer(scale, scale)
-    root: NDArray[np.float64] = np.linalg.cholesky(
+    root: NDArray[Any] = np.linalg.cholesky(
         covariance + np.diag(RELATIVE_JITTER * scale**2)
     )
     return root

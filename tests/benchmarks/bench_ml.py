@@ -1,0 +1,286 @@
+"""One eye per image, as for training networks: processor time beside error.
+
+    python -m tests.benchmarks.bench_ml [--quick] [--json]
+
+An image of 256x256 px and 20 deg at 2 m, through another drawn person, with another
+pupil and focus, for each image; one thread.  Times are those of all processes, for an
+image: the filter alone, without reading or writing files.
+
+- ``same eye``: one eye and state for all images.
+- ``worker``: a new eye for each image, estimated by the worker process.
+- ``no worker``: the same in the calling thread.
+- ``one state``: the same, with ranges of pupil and focus that are the image's state.
+- ``bank, cold`` and ``bank, warm``: eyes of a bank, whose files are first read from the
+  disk, and then in memory.
+
+Errors are the largest difference from the images of ``worker``, in steps of 8 bits, and
+for ``worker`` and ``one state`` the PSNR of the worst of some images against exact PSFs
+(``render_tolerance=0``).  `albumentations` and `kornia` blur the same image with a
+Gaussian if they are installed: one blur for all pixels and colors, of no eye.  Writes
+results/ml.json.
+"""
+
+from filter_service import one_blas_thread  # noqa: F401, I001  (before any numpy)
+
+import argparse
+import importlib.util
+import os
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from estimator.threads import THREADS_VARIABLE
+from filter_service import Camera, EyeBank, EyeFilter, FilterSettings
+from tests.benchmarks.harness import Row, memory_mb, publish
+from tests.numerical.scene_frames import scene_view
+
+SIDE_PX, FOV_DEG, DISTANCE_M = 256, 20.0, 2.0
+PUPILS_MM, FOCI_DPT = (2.5, 5.5), (0.0, 1.0)
+MODES = ("dynamic", "on-axis")
+COUNT, QUICK_COUNT = 24, 3
+BANK_COUNT, QUICK_BANK_COUNT = 200, 3
+EXACT_COUNT, QUICK_EXACT_COUNT = 4, 1
+CLOCK_HZ = os.sysconf("SC_CLK_TCK")
+
+
+def processor_s() -> float:
+    """Return the processor time of this process and of those that it started."""
+    total_s = 0.0
+    children = Path(f"/proc/self/task/{os.getpid()}/children").read_text()
+    for number in children.split():
+        stat = Path(f"/proc/{number}/stat").read_text().rsplit(")", 1)[1].split()
+        total_s += (int(stat[11]) + int(stat[12])) / CLOCK_HZ
+    return total_s + time.process_time()
+
+
+def people(count: int) -> list[dict[str, Any]]:
+    """Return drawn persons of random refraction and age."""
+    rng = np.random.default_rng(7)
+    return [
+        {
+            "kind": "prescription",
+            "sphere_dpt": round(float(rng.normal(-1.0, 1.5)), 2),
+            "cylinder_dpt": -round(float(rng.gamma(1.2, 0.4)), 2),
+            "axis_deg": round(float(rng.uniform(1.0, 180.0))),
+            "age_years": round(float(rng.uniform(20.0, 60.0))),
+            "sample": number,
+        }
+        for number in range(count)
+    ]
+
+
+def states(count: int) -> list[dict[str, float]]:
+    """Return random pupils and foci."""
+    rng = np.random.default_rng(8)
+    return [
+        {
+            "pupil_diameter_mm": round(float(rng.uniform(*PUPILS_MM)), 2),
+            "focus_dpt": round(float(rng.uniform(*FOCI_DPT)), 2),
+        }
+        for _ in range(count)
+    ]
+
+
+def one_state(settings: FilterSettings, state: dict[str, float]) -> FilterSettings:
+    """Return settings whose ranges of pupil and focus are one state."""
+    pupil_mm, focus_dpt = state.values()
+    return settings.changed(
+        pupil_range_mm=(pupil_mm, pupil_mm), focus_range_dpt=(focus_dpt, focus_dpt)
+    )
+
+
+class Runs:
+    """Images through many eyes, in several ways."""
+
+    def __init__(self, mode: str, camera: Camera) -> None:
+        self.mode, self.camera = mode, camera
+        self.settings = FilterSettings(
+            mode=mode,
+            pupil_range_mm=PUPILS_MM,
+            focus_range_dpt=FOCI_DPT,
+            object_planes_dpt=(1.0 / DISTANCE_M,),
+        )
+        view = scene_view("courtyard", width_px=SIDE_PX, height_px=SIDE_PX)
+        self.frame = view.color, np.full((SIDE_PX, SIDE_PX), DISTANCE_M, np.float32)
+        self.rows: list[Row] = []
+
+    def images(
+        self,
+        profiles: list[Any],
+        *,
+        worker: bool = False,
+        is_one_state: bool = False,
+        **options: Any,
+    ) -> tuple[list[np.ndarray], np.ndarray]:
+        """Return images and their processor times, ms, after one that is not timed."""
+        found, times_ms = [], []
+        with EyeFilter(
+            camera=self.camera, engine="native", worker=worker
+        ) as eye_filter:
+            clock = processor_s if worker else time.process_time
+            every = [profiles[-1], *profiles]
+            for profile, state in zip(
+                every, [states(1)[0], *states(len(profiles))], strict=True
+            ):
+                start_s = clock()
+                settings = self.settings
+                if is_one_state:
+                    settings = one_state(settings, state)
+                eye_filter.set_profile(profile, settings=settings)
+                seen = eye_filter.filter(*self.frame, **state, whole=True, **options)
+                found.append(seen.color)
+                times_ms.append(1e3 * (clock() - start_s))
+        return found[1:], np.array(times_ms[1:])
+
+    def same_eye(self, count: int) -> np.ndarray:
+        """Return the processor times, ms, of one eye and state."""
+        times_ms = []
+        with EyeFilter(
+            people(1)[0], self.camera, self.settings, engine="native"
+        ) as eye_filter:
+            for _ in range(count + 2):
+                start_s = time.process_time()
+                eye_filter.filter(*self.frame, **states(1)[0])
+                times_ms.append(1e3 * (time.process_time() - start_s))
+        return np.array(times_ms[2:])
+
+    def add(
+        self, method: str, times_ms: np.ndarray, name: str, error: float, to: str
+    ) -> None:
+        """Add a row; its time is the mean, because eyes differ."""
+        self.rows.append(
+            Row(
+                *("ml", method, self.mode, f"{SIDE_PX}x{SIDE_PX}", times_ms.size),
+                *(float(times_ms.mean()), float(np.percentile(times_ms, 95))),
+                *(memory_mb(), name, float(error), to),
+            )
+        )
+
+
+def difference(first: list[np.ndarray], second: list[np.ndarray]) -> int:
+    """Return the largest difference of images, steps of 8 bits."""
+    return max(
+        int(np.abs(a.astype(int) - b).max()) for a, b in zip(first, second, strict=True)
+    )
+
+
+def worst_db(images: list[np.ndarray], exact: list[np.ndarray]) -> float:
+    """Return the lowest PSNR of images, dB."""
+    errors = [
+        np.square((a.astype(float) - b) / 255.0).mean()
+        for a, b in zip(images, exact, strict=False)
+    ]
+    return float(-10.0 * np.log10(max(*errors, 1e-12)))
+
+
+def drop_from_memory(folder: Path) -> None:
+    """Make the system forget the content of files, which it then reads again."""
+    for path in folder.iterdir():
+        descriptor = os.open(path, os.O_RDONLY)
+        os.posix_fadvise(descriptor, 0, 0, os.POSIX_FADV_DONTNEED)
+        os.close(descriptor)
+
+
+def run_mode(
+    mode: str, counts: tuple[int, int, int], folder: Path, details: list[dict]
+) -> list[Row]:
+    """Measure all ways of one mode."""
+    count, bank_count, exact_count = counts
+    runs = Runs(mode, Camera.from_fov(FOV_DEG, width_px=SIDE_PX, height_px=SIDE_PX))
+    eyes = people(bank_count)
+    some = eyes[:count]
+    step = "difference, steps"
+    runs.add("same eye", runs.same_eye(count), step, 0.0, "itself")
+    exact, _ = runs.images(some[:exact_count], is_one_state=True, render_tolerance=0.0)
+    expected, times_ms = runs.images(some, worker=True)
+    runs.add("worker", times_ms, "PSNR, dB", worst_db(expected, exact), "exact PSFs")
+    found, times_ms = runs.images(some)
+    runs.add("no worker", times_ms, step, difference(found, expected), "worker")
+    found, times_ms = runs.images(some, is_one_state=True)
+    runs.add("one state", times_ms, "PSNR, dB", worst_db(found, exact), "exact PSFs")
+    start_s = time.perf_counter()
+    bank = EyeBank.build(folder, eyes, runs.camera, runs.settings)
+    build_s = time.perf_counter() - start_s
+    sizes_mb = [path.stat().st_size / 1e6 for path in folder.glob("eye_*")]
+    details.append(
+        {
+            "mode": mode,
+            "bank_eyes": len(bank),
+            "build_s": round(build_s, 1),
+            "mean_mb": round(float(np.mean(sizes_mb)), 3),
+            "largest_mb": round(max(sizes_mb), 3),
+        }
+    )
+    drop_from_memory(folder)
+    for method in ("bank, cold", "bank, warm"):
+        found, times_ms = runs.images(list(bank))
+        runs.add(method, times_ms, step, difference(found[:count], expected), "worker")
+    return runs.rows
+
+
+def blur_rows(count: int) -> list[Row]:
+    """Return rows of Gaussian blurs of other packages, if they are installed."""
+    color = scene_view("courtyard", width_px=SIDE_PX, height_px=SIDE_PX).color
+    calls: dict[str, Callable[[], object]] = {}
+    if importlib.util.find_spec("albumentations"):
+        import albumentations
+
+        blur = albumentations.GaussianBlur(sigma_limit=(2.0, 2.0), p=1.0)
+        calls["albumentations"] = lambda: blur(image=color)
+    if importlib.util.find_spec("kornia"):
+        import kornia
+        import torch
+
+        torch.set_num_threads(1)
+        batch = torch.from_numpy(color).movedim(-1, 0)[None].float()
+        calls["kornia"] = lambda: kornia.filters.gaussian_blur2d(
+            batch, (13, 13), (2.0, 2.0)
+        )
+    rows = []
+    for method, call in calls.items():
+        times_ms = []
+        for _ in range(count + 2):
+            start_s = time.process_time()
+            call()
+            times_ms.append(1e3 * (time.process_time() - start_s))
+        median_ms, p95_ms = np.percentile(times_ms[2:], (50, 95)).tolist()
+        rows.append(
+            Row(
+                *("ml", method, "Gaussian, 2 px", f"{SIDE_PX}x{SIDE_PX}", count),
+                *(median_ms, p95_ms, memory_mb(), "no eye", float("nan"), "none"),
+            )
+        )
+    return rows
+
+
+def main() -> None:
+    """Run from the command line."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--quick", action="store_true", help="three eyes")
+    parser.add_argument("--json", action="store_true", help="print the report alone")
+    options = parser.parse_args()
+    os.environ[THREADS_VARIABLE] = "1"
+    counts = COUNT, BANK_COUNT, EXACT_COUNT
+    if options.quick:
+        counts = QUICK_COUNT, QUICK_BANK_COUNT, QUICK_EXACT_COUNT
+    rows: list[Row] = []
+    details: list[dict] = []
+    with tempfile.TemporaryDirectory() as name:
+        for mode in MODES:
+            rows += run_mode(mode, counts, Path(name) / mode, details)
+    rows += blur_rows(counts[0])
+    publish(
+        "ml",
+        rows,
+        as_json=options.json,
+        is_whole=not options.quick,
+        details={"banks": details},
+    )
+
+
+if __name__ == "__main__":
+    main()
