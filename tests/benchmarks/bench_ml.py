@@ -28,6 +28,7 @@ import os
 import tempfile
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -47,14 +48,25 @@ EXACT_COUNT, QUICK_EXACT_COUNT = 4, 1
 CLOCK_HZ = os.sysconf("SC_CLK_TCK")
 
 
-def processor_s() -> float:
-    """Return the processor time of this process and of those that it started."""
-    total_s = 0.0
-    children = Path(f"/proc/self/task/{os.getpid()}/children").read_text()
-    for number in children.split():
-        stat = Path(f"/proc/{number}/stat").read_text().rsplit(")", 1)[1].split()
-        total_s += (int(stat[11]) + int(stat[12])) / CLOCK_HZ
-    return total_s + time.process_time()
+def _stat(folder: Path) -> list[str]:
+    """Return the fields of a process after its name."""
+    return (folder / "stat").read_text().rsplit(")", 1)[1].split()
+
+
+def children() -> list[Path]:
+    """Return the folders in /proc of the processes that this one started."""
+    found = []
+    for folder in Path("/proc").glob("[0-9]*"):
+        with suppress(OSError):  # it has ended
+            if int(_stat(folder)[1]) == os.getpid():
+                found.append(folder)
+    return found
+
+
+def processor_s(others: list[Path]) -> float:
+    """Return the processor time of this process and of others."""
+    ticks = sum(int(own) for folder in others for own in _stat(folder)[11:13])
+    return ticks / CLOCK_HZ + time.process_time()
 
 
 def people(count: int) -> list[dict[str, Any]]:
@@ -121,19 +133,19 @@ class Runs:
         with EyeFilter(
             camera=self.camera, engine="native", worker=worker
         ) as eye_filter:
-            clock = processor_s if worker else time.process_time
+            others = children()
             every = [profiles[-1], *profiles]
             for profile, state in zip(
                 every, [states(1)[0], *states(len(profiles))], strict=True
             ):
-                start_s = clock()
+                start_s = processor_s(others)
                 settings = self.settings
                 if is_one_state:
                     settings = one_state(settings, state)
                 eye_filter.set_profile(profile, settings=settings)
                 seen = eye_filter.filter(*self.frame, **state, whole=True, **options)
                 found.append(seen.color)
-                times_ms.append(1e3 * (clock() - start_s))
+                times_ms.append(1e3 * (processor_s(others) - start_s))
         return found[1:], np.array(times_ms[1:])
 
     def same_eye(self, count: int) -> np.ndarray:
