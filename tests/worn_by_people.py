@@ -64,7 +64,7 @@ def kernel_transfer(eye: MeasuredWavefront, pupil_mm: float) -> Transfer:
     )
     cycles_per_px = FREQUENCIES_CPD * DEG_PER_MRAD * PIXEL_MRAD
     places = np.arange(-psf.radius_px, psf.radius_px + 1)
-    wave = np.exp(-2j * np.pi * np.outer(cycles_per_px, places))
+    wave = np.exp(2j * np.pi * np.outer(cycles_per_px, places))  # as in `Transfer`
     pixel = np.sinc(cycles_per_px)
     upward = psf.kernel[::-1].astype(float) * (1.0 - psf.lost_energy_ratio)
     return Transfer(FREQUENCIES_CPD, wave @ upward @ wave.T / np.outer(pixel, pixel))

@@ -153,13 +153,16 @@ def _real(values: NDArray[np.complex128]) -> NDArray[np.float64]:
 def _at(
     transfer: Transfer, x_cpd: NDArray[np.float64], y_cpd: NDArray[np.float64]
 ) -> NDArray[np.complex128]:
-    """Return the transfer (n,) at frequencies (n,)."""
+    """Return the transform of the PSF (n,) at frequencies (n,), exp(-2 pi i f . angle).
+
+    Spectra of letters have this kernel; a `Transfer` has the conjugate one.
+    """
     step_cpd = transfer.frequency_cpd[1] - transfer.frequency_cpd[0]
     middle = (transfer.frequency_cpd.size - 1) / 2
     positions = middle + np.stack([y_cpd, x_cpd]) / step_cpd
     parts = (transfer.transfer_ratio.real, transfer.transfer_ratio.imag)
     real, imaginary = (map_coordinates(part, positions, order=1) for part in parts)
-    found: NDArray[np.complex128] = real + 1j * imaginary
+    found: NDArray[np.complex128] = real - 1j * imaginary
     return found
 
 

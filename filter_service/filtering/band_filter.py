@@ -27,7 +27,7 @@ from filter_service.displays import LIMITS_NM, Triple, display_wavelengths_nm
 from filter_service.errors import BadMessage
 from filter_service.filtering.eye_filter import EyeFilter
 from filter_service.filtering.planned_frame import Filtered
-from filter_service.filtering.stream_eyes import Profile, as_profile
+from filter_service.given_profile import Profile, as_profile
 from filter_service.rgbd_view import RgbdView, as_cameras
 from filter_service.settings import (
     DEFAULTS,

@@ -18,7 +18,7 @@ from estimator.acuity import (
     retina_nyquist_cpd,
     white_light_transfer,
 )
-from estimator.acuity.observer import CHART_CD_M2, _noise_ratio
+from estimator.acuity.observer import CHART_CD_M2, _at, _noise_ratio
 from estimator.acuity.transfer import (
     WHITE_LIGHT,
     contrast_sensitivity,
@@ -34,6 +34,7 @@ from estimator.profiles.typical_aberrations import (
     TYPICAL_PUPIL_MM,
     typical_zernike_um,
 )
+from estimator.psf.compute import compute_psfs
 from estimator.psf.stiles_crawford import StilesCrawford
 from tests import human_data
 
@@ -458,3 +459,28 @@ def test_over_the_field_the_retina_limits_sharp_eyes():
     # Gratings at 20 degrees are resolved up to 5 to 10 cycles a degree.
     assert np.all((found.log_mar[1:] > 0.3) & (found.log_mar[1:] < 1.0))
     assert fractions[-1] == 1.0
+
+
+@pytest.mark.parametrize("j", [7, 8])
+def test_letters_are_seen_through_the_psf_that_is_not_turned(j):
+    zernike_um = np.zeros(28)
+    zernike_um[[3, j]] = 0.05, 0.25
+    pupil = {"zernike_radius_mm": 2.0, "wavelength_nm": 555.0}
+    pixel_arcmin = 0.25
+    (psf,) = compute_psfs(
+        zernike_um[None],
+        pupil_diameter_mm=4.0,
+        wavelength_nm=555.0,
+        pixel_pitch_mrad=np.deg2rad(pixel_arcmin / 60.0) * 1e3,
+        radius_px=160,
+        method="fourier",
+    )
+    along_deg = np.arange(-psf.radius_px, psf.radius_px + 1) * pixel_arcmin / 60.0
+    x_cpd = np.array([0.0, 0.0, 6.0, 4.0, -4.0, 9.0])
+    y_cpd = np.array([6.0, -9.0, 0.0, 4.0, 7.0, -5.0])
+    over_x = np.exp(-2j * np.pi * np.outer(along_deg, x_cpd))
+    over_y = np.exp(2j * np.pi * np.outer(along_deg, y_cpd))  # rows grow downward
+    wanted = np.einsum("yx,xn,yn->n", psf.kernel, over_x, over_y)
+    found = _at(optical_transfer(zernike_um, **pupil), x_cpd, y_cpd)
+    assert np.abs(wanted.imag).max() > 0.1
+    np.testing.assert_allclose(found, wanted, atol=0.012)
