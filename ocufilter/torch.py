@@ -76,6 +76,8 @@ class SeeThrough(torch.nn.Module):
         Settings of the filter.
     render_tolerance : float
         As for `EyeFilter.operator`.
+    accuracy : "normal" or "fine"
+        Accuracy of gradients by pupil and focus, as for `image_derivatives`.
 
     Raises
     ------
@@ -94,12 +96,13 @@ class SeeThrough(torch.nn.Module):
         gaze_deg: tuple[float, float] | None = None,
         settings: FilterSettings | Mapping[str, Any] = FilterSettings(),  # noqa: B008
         render_tolerance: float = 1.0,
+        accuracy: str = "normal",
     ) -> None:
         super().__init__()
         self.profile, self.camera, self.settings = profile, camera, settings
         self.depth_m, self.gaze_deg = depth_m, gaze_deg
         self.pupil_diameter_mm, self.focus_dpt = pupil_diameter_mm, focus_dpt
-        self.render_tolerance = render_tolerance
+        self.render_tolerance, self.accuracy = render_tolerance, accuracy
         self._filter: EyeFilter | None = None
         self._made: tuple[Any, dict[str, Any], FilterOperator] | None = None
         self._pid = 0
@@ -206,6 +209,7 @@ class SeeThrough(torch.nn.Module):
             pupil_diameter_mm=pupil_diameter_mm,
             focus_dpt=focus_dpt,
             gaze_deg=self.gaze_deg,
+            accuracy=self.accuracy,
         )
         return {
             name: torch.from_numpy(image).movedim(-1, -3)

@@ -10,7 +10,13 @@ import pytest
 import torch
 from torch.utils.data import DataLoader, Dataset
 
-from filter_service import Camera, EyeFilter, FilterSettings, RgbdView
+from filter_service import (
+    Camera,
+    EyeFilter,
+    FilterSettings,
+    RgbdView,
+    image_derivatives,
+)
 from ocufilter.torch import SeeThrough
 from tests.source_tree import ROOT
 
@@ -198,6 +204,29 @@ def test_gradients_by_pupil_and_focus(see):
     assert color.grad.abs().sum() > 0.0
     own.close()
     exact.close()
+
+
+def test_fine_gradients_are_those_of_fine_derivatives():
+    settings = replace(SETTINGS, chromatic=False)
+    depth_m = np.full((HEIGHT, WIDTH), 0.2, np.float32)
+    own = SeeThrough(
+        *("myopia", CAMERA, depth_m), **STATE, settings=settings, accuracy="fine"
+    )
+    own.pupil_diameter_mm = torch.tensor(4.0, requires_grad=True)
+    color = rand()
+    own(color).square().sum().backward()
+    with EyeFilter("myopia", CAMERA, settings) as eye_filter:
+        slopes = image_derivatives(
+            eye_filter,
+            color.permute(1, 2, 0).numpy().copy(),
+            *(depth_m, ["pupil_diameter_mm"]),
+            **STATE,
+            accuracy="fine",
+        )
+    slope = torch.from_numpy(slopes["pupil_diameter_mm"]).permute(2, 0, 1)
+    wanted = float((2.0 * own(color).detach() * slope).sum())
+    assert float(own.pupil_diameter_mm.grad) == pytest.approx(wanted, rel=1e-4)
+    own.close()
 
 
 def test_training_finds_the_focus():
