@@ -54,6 +54,10 @@ MAX_EYES = 4
 """Cache size: the eyes of a stereo frame, and of other clients that stream at the same
 time."""
 
+MAX_EYES_MB = 300.0
+"""Memory up to which more eyes are cached: that of four of 1280x720.  The groups of
+`BandFilter` are eleven eyes for 31 bands, of 10 MB each at 480x270."""
+
 
 @dataclass(eq=False)
 class EyeState:
@@ -96,7 +100,9 @@ class EyeStates:
             if released:
                 found.arrays = released[-1]
                 found.arrays.restart()
-        self._eyes = [*others[1 - MAX_EYES :], found]
+        self._eyes = [*others, found]
+        while len(self._eyes) > MAX_EYES and self.memory_mb > MAX_EYES_MB:
+            del self._eyes[0]
         return found
 
     @property
