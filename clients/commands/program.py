@@ -41,6 +41,10 @@ COMMANDS = {
         "clients.commands.filter_image:filter_image",
         "Filter one image with depth through one eye.",
     ),
+    "bands": (
+        "clients.commands.filter_bands:filter_bands",
+        "Filter an image of many wavelengths; write bands, cone signals or XYZ.",
+    ),
     "correct": (
         "clients.commands.correct_image:correct_image",
         "Solve for the picture that a viewer sees as it was meant.",

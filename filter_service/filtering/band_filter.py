@@ -31,6 +31,7 @@ from filter_service.given_profile import Profile, as_profile
 from filter_service.rgbd_view import RgbdView, as_cameras
 from filter_service.settings import (
     DEFAULTS,
+    DepthKind,
     Engine,
     FilterSettings,
     RenderOptionValues,
@@ -222,6 +223,7 @@ class BandFilter:
         pupil_diameter_mm: float,
         focus_dpt: float,
         gaze_deg: tuple[float, float] | None = None,
+        depth_kind: DepthKind = "planar",
         hidden_bands: NDArray[Any] | None = None,
         hidden_depth_m: NDArray[Any] | None = None,
         timeout_s: float = 120.0,
@@ -234,7 +236,9 @@ class BandFilter:
         bands : (height, width, n) float32 or float16
             Light of each wavelength, in any unit.
         depth_m : (height, width) float32
-            View-space z in meters.
+            Depth in meters.
+        depth_kind : "planar" or "radial"
+            View-space z, or distance from the eye.
         hidden_bands, hidden_depth_m : like ``bands`` and ``depth_m``, optional
             Hidden layer, see `RgbdView`.
         pupil_diameter_mm, focus_dpt, gaze_deg, timeout_s, options
@@ -261,6 +265,7 @@ class BandFilter:
                 group.of(bands),
                 depth_m,
                 self.camera.tangents,
+                depth_kind,
                 hidden_color=None if hidden_bands is None else group.of(hidden_bands),
                 hidden_depth_m=hidden_depth_m,
             )
