@@ -45,7 +45,8 @@ settings = FilterSettings(
     object_planes_dpt=(DISTANCE_DPT,),  # and a single distance
 )
 rows, pictures = [], []
-with EyeFilter("emmetropia", DISPLAY.camera, settings) as eye:
+# without a worker process, an eye for few images takes less processor time
+with EyeFilter("emmetropia", DISPLAY.camera, settings, worker=False) as eye:
     for number in range(PEOPLE_COUNT):
         profile = person()
         pupil_mm = round(float(rng.uniform(2.5, 5.0)), 1)

@@ -62,7 +62,8 @@ class SeeThrough(torch.nn.Module):
     Parameters
     ----------
     profile : EyeProfile, mapping, str or Path
-        Profile, as for `EyeFilter`.
+        Profile, as for `EyeFilter`.  Assign another one to the attribute of the same
+        name to see through another eye, such as one of an `EyeBank` for each sample.
     camera : Camera
     depth_m : (height, width) float32, RgbdView, or sequence of RgbdView
         Depth, as for `EyeFilter.operator`.  Assign another array to the attribute of
@@ -78,6 +79,8 @@ class SeeThrough(torch.nn.Module):
         As for `EyeFilter.operator`.
     accuracy : "normal" or "fine"
         Accuracy of gradients by pupil and focus, as for `image_derivatives`.
+    worker : bool
+        As for `EyeFilter`.
 
     Raises
     ------
@@ -97,14 +100,17 @@ class SeeThrough(torch.nn.Module):
         settings: FilterSettings | Mapping[str, Any] = FilterSettings(),  # noqa: B008
         render_tolerance: float = 1.0,
         accuracy: str = "normal",
+        worker: bool = True,
     ) -> None:
         super().__init__()
         self.profile, self.camera, self.settings = profile, camera, settings
         self.depth_m, self.gaze_deg = depth_m, gaze_deg
         self.pupil_diameter_mm, self.focus_dpt = pupil_diameter_mm, focus_dpt
         self.render_tolerance, self.accuracy = render_tolerance, accuracy
+        self.worker = worker
         self._filter: EyeFilter | None = None
         self._made: tuple[Any, dict[str, Any], FilterOperator] | None = None
+        self._opened_profile: Any = None
         self._pid = 0
 
     def forward(self, color: torch.Tensor) -> torch.Tensor:
@@ -221,7 +227,13 @@ class SeeThrough(torch.nn.Module):
             self._forget()
             self._pid = os.getpid()
         if self._filter is None:
-            self._filter = EyeFilter(self.profile, self.camera, self.settings)
+            self._filter = EyeFilter(
+                self.profile, self.camera, self.settings, worker=self.worker
+            )
+        elif self.profile is not self._opened_profile:
+            self._made = None
+            self._filter.set_profile(self.profile)
+        self._opened_profile = self.profile
         return self._filter
 
     def close(self) -> None:

@@ -9,6 +9,7 @@ best_lens      best-lens: spectacles or a contact lens for a scene
 eye            estimate and field: an eye and its visual field
 optics         wavefront and psf: an eye in one direction
 coefficients   coefficients in other orders, as wavefront and estimate print them
+eye_bank       bank: prebuilt eyes of many persons
 image_quality  mtf, acuity and through-focus: an eye in lists of states
 state_options  options of such lists
 checkout       bench and paper, which need a checkout

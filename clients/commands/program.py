@@ -57,6 +57,10 @@ COMMANDS = {
         "clients.batch.program:batch",
         "Filter folders and videos of color and depth, on all cores.",
     ),
+    "bank": (
+        "clients.commands.eye_bank:bank",
+        "Build the eyes of many persons once, for training data.",
+    ),
     "stimuli": (
         "clients.stimuli.program:stimuli",
         "Draw stimuli of exact angular size, and filter them through eyes.",

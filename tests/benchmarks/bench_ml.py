@@ -243,7 +243,7 @@ def blur_rows(count: int) -> list[Row]:
 
         blur = albumentations.GaussianBlur(sigma_limit=(2.0, 2.0), p=1.0)
         calls["albumentations"] = lambda: blur(image=color)
-    if importlib.util.find_spec("kornia"):
+    if all(map(importlib.util.find_spec, ("kornia", "torch"))):
         import kornia
         import torch
 

@@ -1,5 +1,6 @@
 """Banks of prebuilt eyes: the same bytes, and what damaged or foreign files do."""
 
+import json
 import multiprocessing
 import shutil
 import sys
@@ -7,16 +8,21 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
+from clients.commands.program import app
 from filter_service import EyeBank, EyeFilter, FilterSettings
 from filter_service.building import eye_bank
 from filter_service.camera import Camera
 from filter_service.errors import BadMessage, BuildFailed
 
 CAMERA = Camera.from_fov(8.0, width_px=64, height_px=48)
-SETTINGS = FilterSettings(
-    pupil_range_mm=(3.0, 4.0), focus_range_dpt=(0.0, 0.5), object_planes_dpt=(0.5,)
-)
+RANGES = {
+    "pupil_range_mm": (3.0, 4.0),
+    "focus_range_dpt": (0.0, 0.5),
+    "object_planes_dpt": (0.5,),
+}
+SETTINGS = FilterSettings(**RANGES)
 PEOPLE = [
     {"kind": "prescription", "sphere_dpt": -0.5, "age_years": 30.0, "sample": number}
     for number in range(2)
@@ -180,6 +186,22 @@ def test_an_eye_that_cannot_be_built_is_named(tmp_path):
         )
     with pytest.raises(BadMessage, match="profiles: "):
         EyeBank.build(tmp_path / "none", [], CAMERA)
+
+
+def test_the_command_builds_a_bank_of_drawn_persons(tmp_path):
+    folder = tmp_path / "people"
+    settings = SETTINGS.changed(mode="on-axis")
+    arguments = (
+        *("bank", folder, "-p", json.dumps(PEOPLE[0]), "--people", 2),
+        *("--fov-deg", 8, "--size", "64x48", "--settings"),
+        json.dumps({"mode": "on-axis", **RANGES}),
+    )
+    ended = CliRunner().invoke(app, [*map(str, arguments), "--json"])
+    assert ended.exit_code == 0, ended.output
+    bank = EyeBank(folder)
+    assert json.loads(ended.stdout)["eyes"] == len(bank) == 2
+    assert (bank.camera, bank.settings) == (CAMERA, settings)
+    assert [eye.sample for eye in bank] == [0, 1]
 
 
 def _seen(folder, frame, results):
