@@ -27,8 +27,10 @@ Importing this package loads no submodules, which keeps clients light.
     atomic_files     atomic file writes
     pictures         colors and depth of pictures, PGM and PPM, upright and in sRGB
     exr_files        OpenEXR files
+    band_files       images of many wavelengths: ENVI, .npy, .mat
     bounded_images   image decoders with memory limits
     color_encoding   color profiles and codes, and conversion to sRGB
+    peripheral_resolution  detail that the retina could resolve
     gl_device        selection of the OpenGL device
     command_line     shared parts of commands: start, output, errors, numbers
     serve            `ocufilter serve`

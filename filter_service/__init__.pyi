@@ -28,6 +28,8 @@ from .filtering.stream_eyes import EyeFailed as EyeFailed
 from .filtering.stream_eyes import EyeReady as EyeReady
 from .filtering.stream_eyes import Preparing as Preparing
 from .gl_device import is_software_renderer as is_software_renderer
+from .peripheral_resolution import limit_resolution as limit_resolution
+from .peripheral_resolution import resolution_cpd as resolution_cpd
 from .rgbd_view import ColorImage as ColorImage
 from .rgbd_view import RgbdView as RgbdView
 from .rgbd_view import as_views as as_views

@@ -111,6 +111,8 @@ from filter_service import correct as correct
 from filter_service import errors as errors
 from filter_service import image_derivatives as image_derivatives
 from filter_service import is_software_renderer as is_software_renderer
+from filter_service import limit_resolution as limit_resolution
 from filter_service import nearest_picture as nearest_picture
 from filter_service import plan_views as plan_views
+from filter_service import resolution_cpd as resolution_cpd
 from filter_service import tangents_from_fov as tangents_from_fov

@@ -4,6 +4,7 @@ program        the `ocufilter` program and the table of its commands
 options        options that commands share: settings, profiles, sizes
 service        status, latency, keys and eyes: a running service and its folders
 filter_image   filter: one image
+filter_bands   bands: one image of many wavelengths
 correct_image  correct: a picture solved for a viewer
 best_lens      best-lens: spectacles or a contact lens for a scene
 eye            estimate and field: an eye and its visual field

@@ -44,6 +44,9 @@ def test_the_examples_of_a_page_run(path, tmp_path):
         assert f"print(error)  # {lines[7]}\n" in path.read_text(encoding="utf-8")
     if path.stem == "opengl":
         assert printed == "1 0\nTrue\n"
+    if path.stem == "bands":
+        shapes = "(36, 64, 14) (36, 64, 3) (36, 64, 3)"
+        assert printed == f"{shapes}\nTrue\n(36, 64, 3)\nTrue (36, 64, 3)\n"
     if path.stem == "gradients":
         assert printed == "True\n(32, 48, 3) True\n"
     if path.stem == "stereo":

@@ -22,6 +22,7 @@ DIMENSIONLESS = {
     "log_amplitude": "logarithm of a ratio",
     "color": "light, sRGB or linear as the header says",
     "hidden_color": "as color",
+    "bands": "light, in the units of the input",
     "light": "linear light in the unit of an image",
     "added_light": "as light",
     "white_level": "as light",
