@@ -43,7 +43,7 @@ COMMANDS = {
     ),
     "bands": (
         "clients.commands.filter_bands:filter_bands",
-        "Filter an image of many wavelengths; write bands, cone signals or XYZ.",
+        "Filter an image of many wavelengths through one eye.",
     ),
     "correct": (
         "clients.commands.correct_image:correct_image",

@@ -135,8 +135,7 @@ class FilteredBands:
 class BandFilter:
     """Filters images of many wavelengths, each through its own PSFs.
 
-    Each group of three bands is an `EyeFilter` with its own PSFs, so that n bands take
-    the time and the memory of n / 3 RGB frames.  Bands at wavelengths of the setting
+    Each group of three bands is an `EyeFilter` with its own PSFs.  Bands at wavelengths of the setting
     ``display`` form a group in its order: they equal the channels of an RGB frame byte
     for byte, if all three are given, or with ``merge=False, bright_pixels=False``,
     which make channels independent.
