@@ -135,10 +135,10 @@ class FilteredBands:
 class BandFilter:
     """Filters images of many wavelengths, each through its own PSFs.
 
-    Each group of three bands is an `EyeFilter` with its own PSFs.  Bands at wavelengths of the setting
-    ``display`` form a group in its order: they equal the channels of an RGB frame byte
-    for byte, if all three are given, or with ``merge=False, bright_pixels=False``,
-    which make channels independent.
+    Each group of three bands is an `EyeFilter` with its own PSFs.  Bands at wavelengths
+    of the setting ``display`` form a group in its order: they equal the channels of an
+    RGB frame byte for byte, if all three are given, or with ``merge=False,
+    bright_pixels=False``, which make channels independent.
 
     The bands are light at the cornea: a profile's yellowing does not change them, but
     sets the age of the lens for cone signals.
