@@ -57,8 +57,19 @@ def test_eyes_in_turn_find_their_kernels_again(lanes, eyes):
             assert seen.color.tobytes() == first.color.tobytes()
 
 
+def test_more_eyes_are_kept_while_their_kernels_are_small(lanes, eyes, monkeypatch):
+    monkeypatch.setattr(renderer, "MAX_EYES", 1)
+    handles = [lanes.load(store) for store, _ in eyes]
+    for _ in range(2):
+        seen = [
+            lanes.render(v, h, **STATE) for (_, v), h in zip(eyes, handles, strict=True)
+        ]
+    assert not any("psf_blend_ms" in frame.stage_times_ms for frame in seen)
+
+
 def test_of_many_eyes_those_used_last_are_kept(lanes, eyes, monkeypatch):
     monkeypatch.setattr(renderer, "MAX_EYES", 2)
+    monkeypatch.setattr(renderer, "MAX_EYES_MB", 0.0)
     handles = [lanes.load(store) for store, _ in eyes]
 
     def blends(number):
