@@ -36,7 +36,7 @@ import numpy as np
 
 from estimator.threads import THREADS_VARIABLE
 from filter_service import Camera, EyeBank, EyeFilter, FilterSettings
-from tests.benchmarks.harness import Row, memory_mb, publish
+from tests.benchmarks.harness import Row, memory_mb, publish, time_calls
 from tests.numerical.scene_frames import scene_view
 
 SIDE_PX, FOV_DEG, DISTANCE_M = 256, 20.0, 2.0
@@ -234,8 +234,8 @@ def run_mode(
     return runs.rows
 
 
-def blur_rows(count: int) -> list[Row]:
-    """Return rows of Gaussian blurs of other packages, if they are installed."""
+def blurs(count: int) -> list[dict]:
+    """Return the times of Gaussian blurs of other packages, if they are installed."""
     color = scene_view("courtyard", width_px=SIDE_PX, height_px=SIDE_PX).color
     calls: dict[str, Callable[[], object]] = {}
     if importlib.util.find_spec("albumentations"):
@@ -252,21 +252,11 @@ def blur_rows(count: int) -> list[Row]:
         calls["kornia"] = lambda: kornia.filters.gaussian_blur2d(
             batch, (13, 13), (2.0, 2.0)
         )
-    rows = []
-    for method, call in calls.items():
-        times_ms = []
-        for _ in range(count + 2):
-            start_s = time.process_time()
-            call()
-            times_ms.append(1e3 * (time.process_time() - start_s))
-        median_ms, p95_ms = np.percentile(times_ms[2:], (50, 95)).tolist()
-        rows.append(
-            Row(
-                *("ml", method, "Gaussian, 2 px", f"{SIDE_PX}x{SIDE_PX}", count),
-                *(median_ms, p95_ms, memory_mb(), "no eye", float("nan"), "none"),
-            )
-        )
-    return rows
+    found = []
+    for name, call in calls.items():
+        median_ms, _ = time_calls(call, repeats=count, clock=time.process_time)
+        found.append({"package": name, "gaussian_2_px_ms": round(median_ms, 3)})
+    return found
 
 
 def main() -> None:
@@ -284,13 +274,12 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as name:
         for mode in MODES:
             rows += run_mode(mode, counts, Path(name) / mode, details)
-    rows += blur_rows(counts[0])
     publish(
         "ml",
         rows,
         as_json=options.json,
         is_whole=not options.quick,
-        details={"banks": details},
+        details={"banks": details, "blurs": blurs(counts[0])},
     )
 
 

@@ -12,6 +12,7 @@ from torch.utils.data import DataLoader, Dataset
 
 from filter_service import (
     Camera,
+    EyeBank,
     EyeFilter,
     FilterSettings,
     RgbdView,
@@ -56,6 +57,28 @@ def test_images_are_those_of_the_filter(see):
             wanted = seen.color.transpose(2, 0, 1)
             np.testing.assert_allclose(image.numpy(), wanted, rtol=2e-6, atol=1e-6)
     assert (see(color) - color).abs().max() > 0.05  # it is blurred
+
+
+def test_each_sample_may_have_another_eye_of_a_bank(tmp_path):
+    people = [
+        {"kind": "prescription", "sphere_dpt": sphere_dpt, "age_years": 30.0}
+        for sphere_dpt in (-1.0, -3.0)
+    ]
+    settings = SETTINGS.changed(
+        pupil_range_mm=(4.0, 4.0), focus_range_dpt=(0.5, 0.5), object_range_dpt=(0.3, 3)
+    )
+    bank = EyeBank.build(tmp_path / "bank", people, CAMERA, settings, workers=1)
+    color, images = rand(), []
+    see = SeeThrough(bank[0], CAMERA, DEPTH_M, **STATE, settings=settings, worker=False)
+    for profile in (*bank, people[0]):
+        see.profile = profile
+        images.append(see(color))
+    see.close()
+    other = SeeThrough(people[1], CAMERA, DEPTH_M, **STATE, settings=settings)
+    torch.testing.assert_close(images[1], other(color), rtol=0.0, atol=0.0)
+    other.close()
+    torch.testing.assert_close(images[2], images[0], rtol=0.0, atol=0.0)
+    assert (images[1] - images[0]).abs().max() > 0.01
 
 
 @pytest.mark.parametrize("method", ["A", "A_adjoint"])
