@@ -77,12 +77,14 @@ from estimator import zernike_values as zernike_values
 from filter_service import Accumulation as Accumulation
 from filter_service import BadMessage as BadMessage
 from filter_service import BandFilter as BandFilter
+from filter_service import BankedEye as BankedEye
 from filter_service import BestLens as BestLens
 from filter_service import BuildingEye as BuildingEye
 from filter_service import Camera as Camera
 from filter_service import ColorImage as ColorImage
 from filter_service import Correction as Correction
 from filter_service import DepthProjection as DepthProjection
+from filter_service import EyeBank as EyeBank
 from filter_service import EyeFailed as EyeFailed
 from filter_service import EyeFilter as EyeFilter
 from filter_service import EyeReady as EyeReady

@@ -84,7 +84,7 @@ class OffMeridianDraw:
 
     Attributes
     ----------
-    frequencies : (N_FEATURES, 2)
+    frequencies_per_deg : (N_FEATURES, 2)
         Angular frequencies, rad/deg.
     phases_rad : (N_FEATURES,)
     amplitudes_um : (N_FEATURES, 12)
@@ -94,7 +94,7 @@ class OffMeridianDraw:
     Rahimi & Recht 2007 (NIPS 20): random Fourier features.
     """
 
-    frequencies: NDArray[np.float64]
+    frequencies_per_deg: NDArray[np.float64]
     phases_rad: NDArray[np.float64]
     amplitudes_um: NDArray[np.float64]
 
@@ -115,7 +115,7 @@ class OffMeridianDraw:
     ) -> NDArray[np.float64]:
         """Return the deviation (n, 12) in directions (n,)."""
         directions_deg = np.stack([h_deg, v_deg], axis=-1)
-        cosines = np.cos(directions_deg @ self.frequencies.T + self.phases_rad)
+        cosines = np.cos(directions_deg @ self.frequencies_per_deg.T + self.phases_rad)
         return v_deg[:, None] / OFF_MERIDIAN_AT_DEG * (cosines @ self.amplitudes_um)
 
 

@@ -33,6 +33,7 @@ from numpy.typing import NDArray
 
 from estimator.field.eye_optics import EyeOptics
 from estimator.field.peripheral_residual import PeripheralResidual
+from estimator.optics.zernike import N_TERMS
 from estimator.profiles.parse import EyeProfile
 from estimator.threads import THREADS_VARIABLE, thread_count
 from filter_service.building.jobs import DEFAULT_LIMITS
@@ -170,9 +171,10 @@ class BankFile:
     plan : CachePlan
     kernels : BankedKernels
     notes : tuple of str
-    phase : (n,), (n,) and (n, 28), optional
-        Azimuths, elevations and the phase of the periphery that every frame needs; see
-        `PeripheralResidual.keep`.
+    known_h_deg, known_v_deg : (n,)
+    known_phase_um : (n, 28), um/mm^degree
+        Fields that every frame needs, and the phase of the periphery there; see
+        `PeripheralResidual.keep`.  Empty for an eye without one.
     """
 
     code: str
@@ -181,7 +183,9 @@ class BankFile:
     plan: CachePlan
     kernels: BankedKernels
     notes: tuple[str, ...]
-    phase: tuple[NDArray[np.float64], ...] | None
+    known_h_deg: NDArray[np.float64]
+    known_v_deg: NDArray[np.float64]
+    known_phase_um: NDArray[np.float64]
 
 
 class BankStore(PsfStore):
@@ -199,8 +203,8 @@ class BankStore(PsfStore):
         self.path, self.notes = path, found.notes
         self._banked = found.kernels.packed()
         periphery = _periphery_of(found.eye)
-        if periphery is not None and found.phase is not None:
-            periphery.keep(*found.phase)
+        if periphery is not None and found.known_h_deg.size:
+            periphery.keep(found.known_h_deg, found.known_v_deg, found.known_phase_um)
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle the path, from which another process maps the file."""
@@ -545,9 +549,10 @@ def _build_missing(folder: Path, first: int, step: int) -> Iterator[str]:
             yield f"failed eye {number}: {text or type(error).__name__}"
             return
         periphery = _periphery_of(eye)
-        phase = None if periphery is None else periphery.last_known()
+        known = None if periphery is None else periphery.last_known()
+        known = known or (np.zeros(0), np.zeros(0), np.zeros((0, N_TERMS)))
         write_file(
-            path, BankFile(header.code, eye, header.spec, plan, kernels, notes, phase)
+            path, BankFile(header.code, eye, header.spec, plan, kernels, notes, *known)
         )
         yield "done"
 
