@@ -48,8 +48,8 @@ class MtfOptions(StateOptions):
         str | None,
         typer.Option(
             metavar="LIST",
-            help="Directions in which gratings vary: 0 for vertical bars, 90 for "
-            "horizontal ones; the mean of all if not given.",
+            help="Directions in which gratings vary, as in `ocufilter stimuli`: 0 for "
+            "vertical bars, 90 for horizontal ones; the mean of all if not given.",
         ),
     ] = None
     white_light: WhiteLight = False

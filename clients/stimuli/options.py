@@ -63,10 +63,15 @@ class StimuliOptions(ImageSetOptions):
     ] = 10.0
     edge: Annotated[bool, typer.Option("--edge", help="Straight edges.")] = False
     orientation_deg: Annotated[
-        str, _numbers("DEG", "Direction of bars and edges; 0 is horizontal.")
-    ] = "90"
+        str,
+        _numbers(
+            "DEG",
+            "Directions in which gratings and edges vary: 0 for vertical bars, 90 for "
+            "horizontal ones, as in `ocufilter mtf`.",
+        ),
+    ] = "0"
     phase_deg: Annotated[
-        str, _numbers("DEG", "Phase of gratings; 0 is a bright bar in the middle.")
+        str, _numbers("DEG", "Phase of gratings; 0 is the peak of a bright bar in the middle.")
     ] = "0"
     contrast: Annotated[
         str, _numbers("X", "Michelson contrast of gratings, Gabors and edges.")
@@ -128,6 +133,13 @@ class StimuliOptions(ImageSetOptions):
             help="Focus distance, dpt; center is that of the display.",
         ),
     ] = CENTER
+    render_tolerance: Annotated[
+        float,
+        typer.Option(
+            help="Rendering error relative to that of other commands; 0 is exact, so "
+            "that contrasts can be measured; 1 is faster."
+        ),
+    ] = 0.0
     format: Annotated[
         Literal["png", "npy", "exr"],
         typer.Option(help="png: 8-bit sRGB; npy, exr: linear light."),

@@ -1,8 +1,10 @@
 """Gratings, Gabors, edges and noise, about a mean light.
 
-Orientations are those of the bars, counterclockwise from horizontal.  Sinusoids are
-sampled at the centers of pixels, so that their contrast does not depend on the pixel;
-square waves and edges are exact means over the area of each pixel.
+Orientations are the directions in which the light varies, counterclockwise from the
+right, as in `ocufilter.Eye.otf`: 0 for vertical bars, 90 for horizontal ones.
+Sinusoids are sampled at the centers of pixels, so that the amplitude of the sinusoid
+does not depend on the pixel; square waves and edges are exact means over the area of
+each pixel.
 """
 
 from __future__ import annotations
@@ -20,6 +22,9 @@ from clients.stimuli.stimulus import Stimulus, stimulus
 NYQUIST = 0.5
 """Largest frequency along a side of a pixel, cycles per px."""
 
+MEAN_TOLERANCE = 0.001
+"""Relative difference of the mean light of a grating that is noted."""
+
 FEW_PX = 4.0
 """Period below which samples miss the peaks of a sinusoid."""
 
@@ -35,7 +40,7 @@ def grating(
     frequency_cpd: float,
     *,
     display: Display,
-    orientation_deg: float = 90.0,
+    orientation_deg: float = 0.0,
     phase_deg: float = 0.0,
     contrast: float = 0.5,
     mean_light: float = 0.5,
@@ -51,9 +56,11 @@ def grating(
     display : Display
         Pixels of the picture.
     orientation_deg : float
-        Direction of the bars, counterclockwise from horizontal; 90 is vertical.
+        Direction in which the grating varies, counterclockwise from the right: 0 for
+        vertical bars, 90 for horizontal ones.
     phase_deg : float
-        With 0, a bright bar is in the middle.
+        With 0, the middle of a bright bar is in the middle of the picture, which is
+        between pixels if the number of pixels is even.
     contrast : float, 0 to 1
         Michelson contrast, of the square wave that of its bars.
     mean_light : float, 0 to 1
@@ -81,8 +88,7 @@ def grating(
         profile = np.cos(2.0 * np.pi * cycles)
     else:
         profile = pixel_mean(_triangle, _parabolas, cycles, across, along)
-    if diameter_arcmin is not None:
-        profile = profile * _disk(display, diameter_arcmin)
+    window = 1.0 if diameter_arcmin is None else _disk(display, diameter_arcmin)
     parameters: dict[str, Any] = {
         "kind": "grating",
         "wave": wave,
@@ -94,8 +100,11 @@ def grating(
         "diameter_arcmin": diameter_arcmin,
     }
     name = f"{wave}_{frequency_cpd:g}cpd_{orientation_deg:g}deg_{phase_deg:g}deg"
-    light = mean_light * (1.0 + contrast * profile)
-    return stimulus(f"{name}_{contrast:g}", light, display, parameters, notes)
+    light = mean_light * (1.0 + contrast * profile * window)
+    if diameter_arcmin is None:
+        notes += _check_mean(float(light.mean()), mean_light, display, across, along)
+    fitted = {"fundamental_contrast": _fundamental_contrast(light, cycles, window)}
+    return stimulus(f"{name}_{contrast:g}", light, display, parameters, notes, fitted)
 
 
 def gabor(
@@ -103,7 +112,7 @@ def gabor(
     *,
     display: Display,
     sd_arcmin: float,
-    orientation_deg: float = 90.0,
+    orientation_deg: float = 0.0,
     phase_deg: float = 0.0,
     contrast: float = 0.5,
     mean_light: float = 0.5,
@@ -141,13 +150,17 @@ def gabor(
     parameters = {**carrier.parameters, "kind": "gabor", "sd_arcmin": sd_arcmin}
     del parameters["wave"], parameters["diameter_arcmin"]
     name = f"gabor_{sd_arcmin:g}arcmin_{carrier.name.removeprefix('sine_')}"
-    return stimulus(name, light, display, parameters, carrier.notes)
+    notes = _check_sampling(frequency_cpd, display, orientation_deg, "sine")
+    across, along = _steps(display.cycles_per_px(frequency_cpd), orientation_deg)
+    cycles = across * x_px + along * y_px
+    fitted = {"fundamental_contrast": _fundamental_contrast(light, cycles, envelope)}
+    return stimulus(name, light, display, parameters, notes, fitted)
 
 
 def edge(
     *,
     display: Display,
-    orientation_deg: float = 90.0,
+    orientation_deg: float = 0.0,
     contrast: float = 0.5,
     mean_light: float = 0.5,
 ) -> Stimulus:
@@ -158,8 +171,9 @@ def edge(
     display : Display
         Pixels of the picture.
     orientation_deg : float
-        Direction of the edge, counterclockwise from horizontal.  At 90 the right side
-        is brighter; the bright side turns with the edge.
+        Direction of the bright side, counterclockwise from the right: 0 for a
+        vertical edge with a brighter right side, 90 for a horizontal one with a
+        brighter upper side.
     contrast : float, 0 to 1
         Michelson contrast of the two sides.
     mean_light : float, 0 to 1
@@ -280,10 +294,46 @@ def _check_sampling(
     return ()
 
 
+def _check_mean(
+    mean: float, mean_light: float, display: Display, across: float, along: float
+) -> tuple[str, ...]:
+    """Note if parts of periods at the edges of the picture change its mean light."""
+    if abs(mean - mean_light) <= MEAN_TOLERANCE * mean_light:
+        return ()
+    periods = (abs(across) * display.width_px, abs(along) * display.height_px)
+    counts = " and ".join(f"{one:.3g}" for one in periods if one)
+    return (
+        f"{counts} periods in the picture: its mean light is {mean:.4f}; with whole "
+        f"periods it is {mean_light:g}",
+    )
+
+
+def _fundamental_contrast(light: Array, cycles: Array, window: Array | float) -> float:
+    """Return amplitude over mean of the sinusoid that fits the pixels best.
+
+    Parameters
+    ----------
+    light : (height, width)
+        Light of a grating.
+    cycles : (height, width)
+        Phase of the sinusoid in cycles.
+    window : (height, width) or 1
+        Envelope of the grating.
+    """
+    turns = 2.0 * np.pi * cycles
+    waves = (np.cos(turns) * window, np.sin(turns) * window)
+    basis = [np.ones_like(light), *(np.broadcast_to(one, light.shape) for one in waves)]
+    gram = np.array([[np.vdot(one, other) for other in basis] for one in basis])
+    projections = np.array([np.vdot(one, light) for one in basis])
+    # At two pixels per period, one of the waves may be zero in all pixels.
+    mean, *amplitudes = np.linalg.lstsq(gram, projections, rcond=1e-9)[0]
+    return float(np.hypot(*amplitudes) / mean) if mean > 0.0 else 0.0
+
+
 def _steps(cycles_per_px: float, orientation_deg: float) -> tuple[float, float]:
     """Return the cycles from pixel to pixel to the right, and upward."""
     angle = math.radians(orientation_deg)
-    across, along = cycles_per_px * math.sin(angle), -cycles_per_px * math.cos(angle)
+    across, along = cycles_per_px * math.cos(angle), cycles_per_px * math.sin(angle)
     # exactly vertical and horizontal bars, whatever the rounding of pi
     return (
         0.0 if abs(across) < 1e-12 * cycles_per_px else across,

@@ -33,6 +33,9 @@ class Stimulus:
         Parameters by name.
     notes : tuple of str
         Problems of the sampling.
+    fitted : dict
+        What is fitted to the light: ``fundamental_contrast`` of gratings and Gabors,
+        the amplitude over the mean of the sinusoid of their frequency.
     """
 
     name: str
@@ -40,6 +43,7 @@ class Stimulus:
     display: Display
     parameters: Mapping[str, Any]
     notes: tuple[str, ...] = field(default=())
+    fitted: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def linear_rgb(self) -> NDArray[np.float32]:
@@ -66,6 +70,7 @@ class Stimulus:
             "least_light": low,
             "most_light": high,
             "michelson_contrast": (high - low) / total if total > 0.0 else 0.0,
+            **self.fitted,
         }
         if (white_nit := self.display.white_nit) is not None:
             for name in ("mean", "least", "most"):
@@ -84,6 +89,7 @@ def stimulus(
     display: Display,
     parameters: Mapping[str, Any],
     notes: tuple[str, ...] = (),
+    fitted: Mapping[str, float] | None = None,
 ) -> Stimulus:
     """Return a stimulus, or raise if its light is beyond black or white.
 
@@ -99,4 +105,4 @@ def stimulus(
             "(white), by less contrast or another mean or background"
         )
     clipped = np.clip(light, 0.0, 1.0).astype(np.float32)
-    return Stimulus(name, clipped, display, dict(parameters), notes)
+    return Stimulus(name, clipped, display, dict(parameters), notes, fitted or {})

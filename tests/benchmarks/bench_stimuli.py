@@ -8,6 +8,9 @@
 - ``areas``: heights of optotypes that follow from their area and closed forms.
 - ``gratings``: period and contrast of sinusoids, by a fit to the pixels.
 - ``text``: height of an x, as the ink of each row.
+- ``seen``: contrasts of gratings of 4 to 20 cpd as one drawn person sees them with a
+  pupil of 3 mm, in red, green and blue, less the MTF of `Eye` times their contrast; at
+  render tolerances 0 (default of the command) and 1.
 - ``set``: 10 stimuli, 20 drawn persons and 2 pupils by one command, and the number of
   frames that report a limit of blur (`blur_limited`).
 
@@ -23,7 +26,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ocufilter import stimuli
+from ocufilter import Eye, EyeFilter, stimuli
 from tests.benchmarks.harness import Row, memory_mb, publish
 from tests.commands import run_command
 from tests.numerical.test_stimuli import (
@@ -32,6 +35,7 @@ from tests.numerical.test_stimuli import (
     extent_arcmin,
     fitted_wave,
     ink,
+    seen_and_expected,
 )
 
 PIXELS_ARCMIN = (0.25, 0.37, 0.5)
@@ -114,7 +118,7 @@ def grating_rows(frequencies_cpd) -> list[Row]:
     for pixel_arcmin in PIXELS_ARCMIN:
         pixels = display(pixel_arcmin, width_px=SIDE_PX, height_px=SIDE_PX)
         for frequency_cpd in frequencies_cpd:
-            for orientation_deg in (90.0, 30.0):
+            for orientation_deg in (0.0, 30.0):
                 start_s = time.perf_counter()
                 found = stimuli.grating(
                     frequency_cpd,
@@ -125,7 +129,7 @@ def grating_rows(frequencies_cpd) -> list[Row]:
                 )
                 times_s.append(time.perf_counter() - start_s)
                 angle = math.radians(orientation_deg)
-                guess = np.array([math.sin(angle), -math.cos(angle)])
+                guess = np.array([math.cos(angle), math.sin(angle)])
                 guess *= 1.0005 * frequency_cpd * pixel_arcmin / 60.0
                 mean, amplitude, right, up, _ = fitted_wave(
                     found.light.astype(float), guess
@@ -140,6 +144,31 @@ def grating_rows(frequencies_cpd) -> list[Row]:
             ("contrast", "contrast_percent", contrasts),
         )
     ]
+
+
+def seen_rows(frequencies_cpd) -> list[Row]:
+    """Return rows of the contrast that an eye sees, for two render tolerances."""
+    body = {"kind": "prescription", "sphere_dpt": 0.0, "sample": 0}
+    eye, rows = Eye(body), []
+    camera = display(0.5, width_px=160, height_px=160).camera
+    with EyeFilter(body, camera, engine="native") as eye_filter:
+        eye_filter.wait()
+        for render_tolerance in (0.0, 1.0):
+            times_s, errors = [], []
+            for frequency_cpd in frequencies_cpd:
+                for orientation_deg in (0.0, 30.0):
+                    start_s = time.perf_counter()
+                    found, expected = seen_and_expected(
+                        *(eye_filter, eye, frequency_cpd, orientation_deg),
+                        render_tolerance=render_tolerance,
+                    )
+                    times_s.append(time.perf_counter() - start_s)
+                    errors.append(np.abs(found - expected).max())
+            case = f"render tolerance {render_tolerance:g}"
+            rows.append(
+                _row("seen", case, times_s, "contrast_error", max(errors), "Eye.mtf")
+            )
+    return rows
 
 
 def set_row(people: int) -> Row:
@@ -166,6 +195,7 @@ def main() -> None:
     heights = HEIGHTS_ARCMIN[3:4] if options.quick else HEIGHTS_ARCMIN
     frequencies = (8.0,) if options.quick else (2.0, 5.5, 12.0, 30.0, 55.0)
     rows = size_rows(heights) + grating_rows(frequencies)
+    rows += seen_rows((12.0,) if options.quick else (4.0, 8.0, 12.0, 20.0))
     rows.append(set_row(2 if options.quick else 20))
     publish("stimuli", rows, as_json=options.json, is_whole=not options.quick)
 
