@@ -84,6 +84,7 @@ def picture_metadata(
     *,
     pupil_diameter_mm: float,
     focus_dpt: float,
+    more: Mapping[str, Any] | None = None,
 ) -> dict[str, str]:
     """Return the metadata of a filtered picture, as text by key.
 
@@ -93,11 +94,14 @@ def picture_metadata(
         As `code_version` returns.
     profile : mapping
         As `profile_identity` returns.
+    more : mapping, optional
+        More facts, as JSON-compatible values.
     """
     facts = {
         "profile": dict(profile),
         "pupil_diameter_mm": pupil_diameter_mm,
         "focus_dpt": focus_dpt,
+        **(more or {}),
     }
     return metadata_of(made_by, facts)
 

@@ -10,8 +10,8 @@ import csv
 import io
 import math
 import unicodedata
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from fractions import Fraction
 from pathlib import Path
 from typing import Any, Protocol, cast
@@ -161,6 +161,9 @@ class SourceFrame:
         Time in a video of color whose frame rate varies.
     fault : str, optional
         Reason why the frame cannot be used, if known before it is read.
+    facts : mapping
+        What the image shows, as JSON-compatible values, for the record and the metadata
+        of its results.
     """
 
     name: str
@@ -172,6 +175,7 @@ class SourceFrame:
     depth_index: int | None = None
     time_s: Fraction | None = None
     fault: str | None = None
+    facts: Mapping[str, Any] = field(default_factory=dict, hash=False)
 
     @property
     def files(self) -> tuple[Path, ...]:
@@ -186,11 +190,11 @@ class SourceFrame:
         return tuple(path for path, index in parts if path and index is not None)
 
     def described(self) -> dict[str, Any]:
-        """Return the camera and the depth format, for JSON."""
+        """Return the camera, the depth format and facts, for JSON."""
         return {
             part: {"kind": type(value).__name__, **asdict(cast(Any, value))}
             for part, value in (("camera", self.optics), ("depth", self.depth_form))
-        }
+        } | dict(self.facts)
 
 
 class BadFrame(ValueError):

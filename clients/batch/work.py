@@ -27,6 +27,7 @@ from filter_service import (
 )
 from filter_service.bounded_images import MAX_FILE_BYTES
 from filter_service.camera import PixelGrid
+from filter_service.displays import display_wavelengths_nm
 from filter_service.errors import WorkerCrashed
 from filter_service.image_files import (
     ImageFile,
@@ -228,6 +229,7 @@ class UnitRunner:
                 profile_identity(profile, self._job.profiles[profile]),
                 pupil_diameter_mm=record["pupil_mm"],
                 focus_dpt=record["focus_dpt"],
+                more=self._more(profile, frame),
             )
             write = partial(
                 write_image,
@@ -241,6 +243,21 @@ class UnitRunner:
             return _failed(profile, frame, error)
         record["ms"]["write"] = _ms_since(start_s)
         return {**record, "file": file.as_posix(), **written}
+
+    def _more(self, profile: str, frame: SourceFrame) -> Record:
+        """Return facts for the metadata of a result whose image has facts."""
+        if not frame.facts:
+            return {}
+        job, form = self._job, frame.depth_form
+        distance_dpt = form.distance_dpt if isinstance(form, Constant) else None
+        return {
+            **frame.facts,
+            "distance_m": 1.0 / distance_dpt if distance_dpt else None,
+            "distance_dpt": distance_dpt,
+            "sample": job.profiles[profile].get("sample"),
+            "display_nm": display_wavelengths_nm(job.settings.display),
+            "render_tolerance": job.render_tolerance,
+        }
 
     def _segment(
         self, unit: Unit, segment: Path, is_wanted: Callable[[], bool]

@@ -106,9 +106,13 @@ class StimulusSet:
             own, states = views.of_frames(
                 [
                     SourceFrame(
-                        name, folder / f"{name}{self.suffix}", None, optics, depth
+                        *(name, folder / f"{name}{self.suffix}", None, optics, depth),
+                        facts={
+                            "stimulus": {"name": one.name, **one.parameters},
+                            "pixel_arcmin": one.display.pixel_arcmin,
+                        },
                     )
-                    for name in some
+                    for name, one in some.items()
                 ]
             )
             frames += own

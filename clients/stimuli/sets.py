@@ -152,7 +152,10 @@ def write_stimulus(path: Path, one: Stimulus) -> dict[str, Any]:
     write = partial(
         write_image,
         image=one.linear_rgb if is_linear else one.srgb,
-        metadata=metadata_of(code_version(), {"stimulus": one.described()}),
+        metadata=metadata_of(
+            code_version(),
+            {"stimulus": one.described(), "pixel_arcmin": one.display.pixel_arcmin},
+        ),
     )
     return write_whole(path, write)
 

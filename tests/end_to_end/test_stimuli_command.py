@@ -55,6 +55,7 @@ def test_pictures_and_their_listing(tmp_path):
         with Image.open(out / one["file"]) as image:
             metadata = json.loads(image.text[METADATA_KEY])
         assert metadata["stimulus"]["name"] == name
+        assert metadata["pixel_arcmin"] == 0.5
     grating = found["stimuli"]["sine_6cpd_0deg_0deg_0.8"]
     assert grating["measured"]["most_nit"] == pytest.approx(90.0, rel=0.01)
     drawn = read_color(out / grating["file"])
@@ -100,6 +101,22 @@ def test_people_pupils_and_foci_see_what_the_filter_shows(tmp_path):
         depth_m = np.full((40, 48), 2.0, np.float32)
         expected = eye.filter(letter.srgb, depth_m, **state).color
     np.testing.assert_array_equal(seen, expected)
+    shown = {
+        "stimulus": {"name": letter.name, **letter.parameters},
+        "pixel_arcmin": 0.5,
+    }
+    with Image.open(out / "p_1/pupil5mm/sloan_C_8arcmin.png") as image:
+        metadata = json.loads(image.text[METADATA_KEY])
+    told_of_view = {
+        "distance_m": 2.0,
+        "distance_dpt": 0.5,
+        "sample": 1,
+        "display_nm": [618.0, 536.0, 453.0],
+        "render_tolerance": 0.0,
+    }
+    assert metadata.items() >= (shown | told_of_view).items()
+    lines = map(json.loads, (out / "manifest.jsonl").read_text().splitlines()[1:])
+    assert all(line["source"].items() >= shown.items() for line in lines)
     manifest = json.loads((out / "manifest.json").read_text())
     assert manifest["made_by"] == code_version()
     assert manifest["source"]["displays"]["display"]["pixel_arcmin"] == 0.5
