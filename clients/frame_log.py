@@ -14,7 +14,8 @@ if TYPE_CHECKING:
     from clients.filter_client import FilteredFrame
 
 Notes = dict[str, dict[str, Any]]
-"""Number of frames and one example of each kind of note."""
+"""Number of frames and one example of each kind of note; if their numbers differ,
+``least`` and ``most`` of each number."""
 
 PERCENTS = {"p50": 50, "p95": 95, "p99": 99}
 _NUMBER = re.compile(r"\d+(\.\d+)?(e-?\d+)?")
@@ -28,8 +29,31 @@ def without_numbers(note: str) -> str:
 def add_notes(notes: Notes, new: Sequence[str]) -> None:
     """Count a frame's notes; notes that differ only in numbers are of one kind."""
     for note in new:
-        kind = without_numbers(note)
-        notes.setdefault(kind, {"frames": 0, "example": note})["frames"] += 1
+        found = notes.setdefault(without_numbers(note), {"frames": 0, "example": note})
+        found["frames"] += 1
+        if note != found["example"]:
+            numbers, first = _numbers(note), _numbers(found["example"])
+            for name, extreme in (("least", min), ("most", max)):
+                found[name] = [*map(extreme, found.get(name, first), numbers)]
+
+
+def _numbers(note: str) -> list[float]:
+    return [float(number[0]) for number in _NUMBER.finditer(note)]
+
+
+def note_line(note: Mapping[str, Any], what: str = "frames") -> str:
+    """Format a note of `Notes` with its count and the ranges of its numbers."""
+    text = note["example"]
+    if "least" in note:
+        ranges = zip(note["least"], note["most"], strict=True)
+
+        def ranged(match: re.Match[str]) -> str:
+            low, high = next(ranges)
+            minus = "-" if text[: match.start()].endswith("-") else ""
+            return match[0] if low == high else f"{low:g} to {minus}{high:g}"
+
+        text = _NUMBER.sub(ranged, text)
+    return f"{note['frames']} {what}: {text}"
 
 
 @dataclass

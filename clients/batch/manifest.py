@@ -1,6 +1,6 @@
 """Record of a batch: a line per frame during the run, and a summary at the end.
 
-    manifest.jsonl   the job, then a line for each frame and each video; if one was
+    manifest.jsonl   the job and facts about its start, then a line for each frame and each video; if one was
                      made again, its last line counts
     manifest.json    the job, counts, failures and notes
 
@@ -51,6 +51,10 @@ _VIDEO = ""
 _ESCAPE = re.compile(r"\\(?:\\|x[89a-f][0-9a-f])")
 _FRAME = [("profile", str), ("frame", str), ("ok", bool)]
 _CONTENT = [("bytes", int), ("sha256", str)]
+FACTS = ("created", "argv", "display_nm")
+"""Fields of the first line that do not determine the images: the time of the start, the
+command line, and the wavelengths of the display."""
+
 COUNTS = ("missing_depth_count", "clamped_depth_count", "overflow_count")
 _Failed = defstruct("_Failed", [*_FRAME, ("error", str)])
 _Video = defstruct("_Video", [("profile", str), ("file", str), *_CONTENT])
@@ -173,8 +177,16 @@ class Manifest:
         Existing folder.
     job : mapping
         Parameters that determine the images, as JSON-compatible values.
+    facts : mapping
+        Facts about the start of the job, such as the time, which `facts` returns when
+        it is resumed.
     read_only : bool
         Whether to leave the file as it is, because another process may write to it.
+
+    Attributes
+    ----------
+    facts : mapping
+        Facts about the start of the job; none in manifests of earlier versions.
 
     Raises
     ------
@@ -185,9 +197,15 @@ class Manifest:
     """
 
     def __init__(
-        self, out: Path, job: Mapping[str, Any], *, read_only: bool = False
+        self,
+        out: Path,
+        job: Mapping[str, Any],
+        *,
+        facts: Mapping[str, Any] | None = None,
+        read_only: bool = False,
     ) -> None:
         self._out = out
+        self.facts: Mapping[str, Any] = facts or {}
         self._path = out / LINES
         self._read_only = read_only
         # Length and offset of lines by profile and frame, for videos `_VIDEO`
@@ -225,6 +243,7 @@ class Manifest:
                 record = _parsed(line, self._path)
                 if end == 0:
                     _check_same(record, job, self._path)
+                    self.facts = {key: record[key] for key in FACTS if key in record}
                 elif record.get("kind") in ("frame", "video"):
                     _check(record, self._path)
                     self._places[_key(record)] = len(line), end
@@ -236,7 +255,7 @@ class Manifest:
             return
         os.ftruncate(self._file, end)
         if end == 0:
-            self._write(_job_line(job))
+            self._write(_job_line(job, self.facts))
 
     def append(self, record: Record) -> None:
         """Append a line for a frame, or for the video of a profile."""
@@ -326,13 +345,15 @@ class Manifest:
         )
 
 
-def begin_manifest(out: Path, job: Mapping[str, Any]) -> None:
+def begin_manifest(
+    out: Path, job: Mapping[str, Any], facts: Mapping[str, Any] | None = None
+) -> None:
     """Replace the manifest of a folder by a new one for a job, atomically."""
-    write_atomically(out / LINES, _job_line(job))
+    write_atomically(out / LINES, _job_line(job, facts or {}))
 
 
-def _job_line(job: Mapping[str, Any]) -> bytes:
-    return _line({"kind": "job", "fingerprint": fingerprint(job), **job})
+def _job_line(job: Mapping[str, Any], facts: Mapping[str, Any]) -> bytes:
+    return _line({"kind": "job", "fingerprint": fingerprint(job), **facts, **job})
 
 
 def _key(record: Record) -> tuple[str, str]:
@@ -392,7 +413,7 @@ def _check_same(found: Record, job: Mapping[str, Any], path: Path) -> None:
     if found.get("fingerprint") == fingerprint(job):
         return
     wanted = json.loads(json.dumps(job))  # lists for tuples, as in the file
-    for name in sorted({*wanted, *found} - {"kind", "fingerprint"}):
+    for name in sorted({*wanted, *found} - {"kind", "fingerprint", *FACTS}):
         if found.get(name) != wanted.get(name):
             before, now = _first_difference(name, found.get(name), wanted.get(name))
             found_text = (
@@ -427,11 +448,12 @@ def write_summary(out: Path, summary: Mapping[str, Any]) -> None:
 
 
 def summary_of(manifest: Manifest, wanted: set[tuple[str, str]]) -> dict[str, Any]:
-    """Return the counts, failures and notes of the requested frames.
+    """Return the counts, failures and notes of the requested frames, and of eyes.
 
     ``wanted`` contains profiles and frames as in the manifest.
     """
     n_done, failures = Counter[str](), []
+    eyes: dict[str, list[str]] = {}
     notes: Notes = {}
     pixels = Counter[str]()
     for record in manifest.records():
@@ -441,6 +463,8 @@ def summary_of(manifest: Manifest, wanted: set[tuple[str, str]]) -> dict[str, An
             failures.append({k: record[k] for k in ("profile", "frame", "error")})
             continue
         n_done[record["profile"]] += 1
+        if "eye_notes" in record:
+            eyes.setdefault(record["profile"], record["eye_notes"])
         add_notes(notes, record["notes"])
         for name in COUNTS:
             pixels[name] += record[name]
@@ -449,9 +473,5 @@ def summary_of(manifest: Manifest, wanted: set[tuple[str, str]]) -> dict[str, An
         "failures": failures,
         **pixels,
         "notes": list(notes.values()),
+        "eye_notes": eyes,
     }
-
-
-def note_line(note: Mapping[str, Any]) -> str:
-    """Format a note with its number of frames."""
-    return f"{note['frames']} frames: {note['example']}"

@@ -10,7 +10,7 @@ from typing import Any
 
 import typer
 
-from clients.batch.manifest import Manifest, note_line
+from clients.batch.manifest import Manifest
 from clients.batch.options import (
     BatchOptions,
     ImageSetOptions,
@@ -30,6 +30,7 @@ from clients.batch.run import (
 )
 from clients.batch.work import EngineUnusable
 from clients.commands.options import with_options
+from clients.frame_log import note_line
 from estimator.bounded_files import printable
 from filter_service.command_line import (
     EXIT_FAILURE,
@@ -88,7 +89,7 @@ def filter_batch(
     if overwrite:
         begin_anew(batch)
     with (
-        Manifest(batch.out, batch.described()) as manifest,
+        Manifest(batch.out, batch.described(), facts=batch.facts()) as manifest,
         Progress("batch", quiet=quiet) as progress,
     ):
         prepare()

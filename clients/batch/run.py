@@ -10,6 +10,7 @@ import fcntl
 import math
 import os
 import re
+import sys
 import tempfile
 import time
 from collections import Counter
@@ -17,6 +18,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass, field
+from datetime import UTC, datetime
 from functools import cache, cached_property, partial
 from pathlib import Path
 from typing import Any, cast
@@ -31,7 +33,6 @@ from clients.batch.manifest import (
     below,
     content_of,
     name_of,
-    note_line,
     records_of,
     remove_parts,
     summary_of,
@@ -42,8 +43,9 @@ from clients.batch.manifest import (
 from clients.batch.pools import ProcessPool, RayPool
 from clients.batch.source import SourceFrame
 from clients.batch.work import Job, Unit, UnitRunner
-from clients.frame_log import Notes, add_notes
+from clients.frame_log import Notes, add_notes, note_line
 from estimator import InvalidFile, thread_count
+from filter_service.displays import display_wavelengths_nm
 
 UNIT_FRAMES = 16
 """Frames per unit of work: few enough that all workers finish at about the same time,
@@ -99,6 +101,15 @@ class Batch:
     def described(self) -> dict[str, Any]:
         """Return the parameters that determine the images, for JSON."""
         return self._described
+
+    def facts(self) -> dict[str, Any]:
+        """Return facts about the start of the job, for the manifest."""
+        now = datetime.now(UTC).isoformat(timespec="seconds")
+        return {
+            "created": now,
+            "argv": ["ocufilter", *map(text_of, sys.argv[1:])],
+            "display_nm": display_wavelengths_nm(self.job.settings.display),
+        }
 
     @cached_property
     def _described(self) -> dict[str, Any]:
@@ -196,7 +207,7 @@ def begin_anew(batch: Batch) -> None:
                 path.unlink(missing_ok=True)
     _remove_segments(batch.out)
     (batch.out / SUMMARY).unlink(missing_ok=True)
-    begin_manifest(batch.out, job)
+    begin_manifest(batch.out, job, batch.facts())
 
 
 def _remove_segments(out: Path) -> None:
@@ -370,7 +381,7 @@ def run_batch(
             "core_seconds": round(cpu_s, 3),
         },
     }
-    write_summary(batch.out, {**batch.described(), **summary})
+    write_summary(batch.out, {**manifest.facts, **batch.described(), **summary})
     return summary
 
 

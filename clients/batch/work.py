@@ -188,6 +188,7 @@ class UnitRunner:
         self._key: tuple[str, Camera] | None = None
         self._failure: FilterError | None = None
         self._readers: dict[Path, VideoReader] = {}
+        self._eye_notes: tuple[str, ...] | None = None  # of an eye without a record
         self.build_s = 0.0
 
     def close(self) -> None:
@@ -362,6 +363,8 @@ class UnitRunner:
         }
         if self.build_s > built_s:
             record["ms"]["build"] = 1e3 * (self.build_s - built_s)
+        if self._eye_notes is not None:
+            record["eye_notes"], self._eye_notes = [*self._eye_notes], None
         return seen.color, color.grid, record
 
     def _prepared(self, profile: str, camera: Camera) -> EyeFilter:
@@ -381,7 +384,9 @@ class UnitRunner:
                 body, settings = self._job.profiles[profile], self._job.settings
                 found.set_profile(body, settings=settings, views=camera)
                 try:
-                    self.build_s += found.wait().build_ms / 1e3
+                    ready = found.wait()
+                    self.build_s += ready.build_ms / 1e3
+                    self._eye_notes = ready.notes
                 except FilterError as error:
                     self._failure = error
                 if not isinstance(self._failure, WorkerCrashed):  # for lack of memory

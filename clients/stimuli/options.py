@@ -71,7 +71,10 @@ class StimuliOptions(ImageSetOptions):
         ),
     ] = "0"
     phase_deg: Annotated[
-        str, _numbers("DEG", "Phase of gratings; 0 is the peak of a bright bar in the middle.")
+        str,
+        _numbers(
+            "DEG", "Phase of gratings; 0 is the peak of a bright bar in the middle."
+        ),
     ] = "0"
     contrast: Annotated[
         str, _numbers("X", "Michelson contrast of gratings, Gabors and edges.")

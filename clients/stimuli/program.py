@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import signal
 import sys
-from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,6 +21,7 @@ from clients.batch.source import Constant, Pinhole, SourceFrame, States
 from clients.batch.views import Views
 from clients.batch.work import EngineUnusable, Job, batch_settings
 from clients.commands.options import read_object, with_options
+from clients.frame_log import Notes, add_notes, note_line
 from clients.provenance import code_version
 from clients.stimuli.display import Display
 from clients.stimuli.options import StimuliOptions, check, displays_of
@@ -264,8 +264,9 @@ def lines_of(summary: dict[str, Any], options: StimuliOptions) -> list[str]:
         f"{options.out / ORIGINALS}: {summary['stimuli']} stimuli of {options.size} "
         f"px, {pixels} arcmin per pixel"
     ]
-    for note, count in Counter(summary["stimulus_notes"]).items():
-        lines.append(f"note: {count} stimuli: {note}")
+    notes: Notes = {}
+    add_notes(notes, summary["stimulus_notes"])
+    lines += [f"note: {note_line(one, 'stimuli')}" for one in notes.values()]
     if "seen" in summary:
         lines += report_lines(summary["seen"], options)
     return lines

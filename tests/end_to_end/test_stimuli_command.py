@@ -3,6 +3,7 @@
 import hashlib
 import json
 import math
+from datetime import datetime
 
 import numpy as np
 import pytest
@@ -123,7 +124,14 @@ def test_people_pupils_and_foci_see_what_the_filter_shows(tmp_path):
     assert "sloan_C_8arcmin" in manifest["source"]["stimuli"]
     assert set(manifest["profiles"]) == {"p_0", "p_1"}
     assert manifest["settings"]["object_planes_dpt"] == [0.5]
+    assert datetime.fromisoformat(manifest["created"]).tzinfo is not None
+    assert manifest["argv"][:3] == ["ocufilter", "stimuli", "--letters"]
+    assert manifest["display_nm"] == [618.0, 536.0, 453.0]
+    assert "drawn with sample 1" in " ".join(manifest["eye_notes"]["p_1"])
     assert "4 of 4 images, 0 of them in this run" in run(*arguments)
+    resumed = json.loads((out / "manifest.json").read_text())
+    for name in ("created", "argv", "eye_notes"):
+        assert resumed[name] == manifest[name]
 
 
 @pytest.mark.clients

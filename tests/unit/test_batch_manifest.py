@@ -8,6 +8,7 @@ import pytest
 
 from clients.batch.manifest import (
     Manifest,
+    ManifestDiffers,
     begin_manifest,
     name_of,
     remove_parts,
@@ -18,6 +19,7 @@ from clients.batch.manifest import (
 from clients.batch.run import Batch
 from clients.batch.source import FieldOfView, Scaled, SourceFrame, States
 from clients.batch.work import Job, batch_settings
+from clients.frame_log import add_notes, note_line
 
 
 def test_any_name_becomes_text_and_no_two_the_same():
@@ -127,3 +129,31 @@ def test_a_video_that_changes_after_it_was_hashed_is_noticed(tmp_path):
     with pytest.raises(OSError, match=r"c\.mkv' changed during the run"):
         batch.check_videos()
     assert batch.described() == described  # the summary is of the run
+
+
+def test_a_job_resumes_at_another_time_and_keeps_the_facts_of_its_start(tmp_path):
+    job, first = {"format": "png"}, {"created": "2026-01-01", "argv": ["ocufilter"]}
+    with Manifest(tmp_path, job, facts=first) as manifest:
+        manifest.append(failed("a"))
+    later = {"created": "2026-01-02", "argv": ["ocufilter", "batch"]}
+    with Manifest(tmp_path, job, facts=later) as manifest:
+        assert manifest.record("eye", "a") is not None
+        assert manifest.facts == first
+    with (
+        pytest.raises(ManifestDiffers, match='format is "npy", but was "png"'),
+        Manifest(tmp_path, {"format": "npy"}, facts=later),
+    ):
+        pass
+
+
+def test_notes_that_differ_in_numbers_are_a_line_with_their_ranges():
+    notes = {}
+    for far_dpt, shift_dpt in (("0.962", "-0.5"), ("0.949", "-1.25"), ("1.065", "-1")):
+        note = f"focus 0.25 dpt is beyond the far point ({far_dpt} dpt), M {shift_dpt}"
+        add_notes(notes, [note, "always the same, 1.50"])
+    lines = [note_line(note) for note in notes.values()]
+    assert lines == [
+        "3 frames: focus 0.25 dpt is beyond the far point (0.949 to 1.065 dpt), "
+        "M -0.5 to -1.25",
+        "3 frames: always the same, 1.50",
+    ]
