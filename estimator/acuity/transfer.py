@@ -187,8 +187,9 @@ class Transfer:
         kept = slice(middle - reach, middle + reach + 1)
         nearby = self.edge_ratio * self.transfer_ratio[kept, kept]
         nearby[reach, reach] = 1.0
-        found: NDArray[np.complex128] = map_coordinates(nearby, reach + steps, order=3)
-        return found
+        points = reach + steps.reshape(2, -1)  # map_coordinates rejects a shape of (2,)
+        found: NDArray[np.complex128] = map_coordinates(nearby, points, order=3)
+        return found.reshape(steps.shape[1:])
 
     def _mean(self, values: NDArray[Any], at_cpd: ArrayLike) -> NDArray[np.float64]:
         """Return the mean (m,) of values (n, n) over orientations."""

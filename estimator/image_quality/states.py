@@ -224,7 +224,7 @@ def result_of(
     sizes = tuple(own[dim].size for dim in dims)
     per_state = coords or {}
     return labeled(
-        values.reshape(*grid.shape, *sizes),
+        values.reshape((*grid.shape, *sizes)),
         (*grid.dims, *dims),
         {**grid.coords, **per_state, **(fixed or {}), **own},
         name=name,

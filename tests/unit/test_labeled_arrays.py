@@ -290,3 +290,30 @@ def test_total_defocus_includes_the_vergence_of_an_object(eye_model):
     far, near = (f / (1.0 - depth_m * f) for f in at_lens_dpt)
     assert near_dpt[1] - far_dpt == pytest.approx(far - near, abs=0.02)
     assert far - near == pytest.approx(2.5, abs=0.05)  # of 3
+
+
+@pytest.mark.long("transfer functions of one state")
+def test_numbers_alone_give_results_without_axes():
+    """Each result is the element of the result for lists of one number."""
+    eye = Eye("emmetropia")
+    white = {"frequency_cpd": 10, "white_light": True, "straylight": True}
+    cases = {
+        "mtf": ({"frequency_cpd": 10}, {"frequency_cpd": 10, "orientation_deg": 30}),
+        "otf": ({"frequency_cpd": 10}, white),
+        "contrast_sensitivity": ({"frequency_cpd": 10}, white),
+        "encircled_energy": ({"radius_arcmin": 1}, {"radius_arcmin": 1}),
+    }
+    for method, options in cases.items():
+        for given in options:
+            found = getattr(eye, method)(**given, pupil_diameter_mm=2)
+            assert found.dims == (), method
+            numbers = ("frequency_cpd", "orientation_deg", "radius_arcmin")
+            lists = {k: [v] if k in numbers else v for k, v in given.items()}
+            listed = getattr(eye, method)(**lists, pupil_diameter_mm=2)
+            np.testing.assert_array_equal(found.values, listed.values.ravel()[0])
+            assert len(list(found.rows())) == 1
+            assert repr(found).startswith(f"<LabeledArray {found.name} ()>")
+    assert eye.through_focus(defocus_dpt=0).dims == ("quantity",)
+    assert eye.acuity().dims == eye.refraction().dims == ("quantity",)
+    assert eye.wavefront().dims == ("term",)
+    assert eye.psf().dims == ("y_arcmin", "x_arcmin")
