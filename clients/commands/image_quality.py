@@ -268,6 +268,10 @@ def _finite(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
+def _text(value: Any) -> str:
+    return f"{value:.6g}" if isinstance(value, float | int) else str(value)
+
+
 def _print_csv(found: LabeledArray) -> None:
     writer = csv.writer(sys.stdout, lineterminator="\n")
     writer.writerow(found.columns())
@@ -279,7 +283,7 @@ def _print_table(eye: str, found: LabeledArray) -> None:
     for note in found.notes:
         print_line(f"note: {note}")
     fixed = [
-        f"{name} {values.item():g}"
+        f"{name} {_text(values.item())}"
         for name, values in found.coords.items()
         if values.ndim == 0
     ]

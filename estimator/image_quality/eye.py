@@ -197,8 +197,11 @@ class Eye:
             Radius of the disc of pixels.  By default, it is the largest one that a
             state requires for 99.9 % of its light, and the sum is 1.
         white_light : bool
-            Whether the light is white, with the wavefront of ``wavelength_nm``; it
-            includes the centered Stiles-Crawford effect.
+            Whether the light is an equal-energy white, as the eye weights it: 457.1,
+            534.0 and 609.5 nm with weights of 0.0384, 0.5760 and 0.3856.  All have
+            the wavefront of ``wavelength_nm``, out of focus by the chromatic aberration
+            between the two wavelengths, and the centered Stiles-Crawford effect.  The
+            result has the coordinate ``light``.
         stiles_crawford : bool
             Whether to apply the Stiles-Crawford effect to light of one wavelength.
         straylight : bool
@@ -213,11 +216,12 @@ class Eye:
         screen = self._tracer.rings and self._tracer.rings.seen_from(
             grid.flat["h_deg"], grid.flat["v_deg"]
         )
+        apodization = self._apodization(stiles_crawford)
         batches = psf_batches(
             lights,
             white_light=white_light,
             pixel_pitch_mrad=MRAD_PER_RAD * np.radians(pixel_arcmin / ARCMIN_PER_DEG),
-            stiles_crawford=self._apodization(stiles_crawford),
+            stiles_crawford=apodization,
             pupil_screen=screen,
         )
         needed_px = max(int(plan_psfs(**batch).radius_px.max()) for _, batch in batches)
@@ -249,7 +253,8 @@ class Eye:
             kernels *= np.float32(1.0 - scatter.fraction)
             kernels += (scatter.per_sr(angle_deg) * pixel_sr).astype(np.float32)
         own = {"y_arcmin": -along, "x_arcmin": along}
-        return result_of(grid, kernels, own, "light_ratio", notes)
+        lit = _light(white_light, apodization, straylight=straylight)
+        return result_of(grid, kernels, own, "light_ratio", notes, fixed=lit)
 
     def otf(
         self,
@@ -298,7 +303,8 @@ class Eye:
         if straylight:
             values = self._scattered(values, np.hypot(x_cpd, y_cpd))
         own = {"frequency_cpd": cpd, "orientation_deg": angles}
-        return result_of(grid, values, own, "transfer_ratio", notes)
+        lit = _light(white_light, apodization, straylight=straylight)
+        return result_of(grid, values, own, "transfer_ratio", notes, fixed=lit)
 
     def mtf(
         self,
@@ -348,7 +354,8 @@ class Eye:
         if straylight:
             values = self._scattered(values, cpd)
         own = {"frequency_cpd": cpd}
-        return result_of(grid, values, own, "modulation_ratio", notes)
+        lit = _light(white_light, apodization, straylight=straylight)
+        return result_of(grid, values, own, "modulation_ratio", notes, fixed=lit)
 
     def contrast_sensitivity(
         self,
@@ -412,7 +419,9 @@ class Eye:
             return found.reshape(radii.shape)
 
         values, notes = mapped(within, lights, radii.shape, notes)
-        return result_of(grid, values, {"radius_arcmin": radii}, "light_ratio", notes)
+        own = {"radius_arcmin": radii}
+        lit = _light(white_light, apodization)
+        return result_of(grid, values, own, "light_ratio", notes, fixed=lit)
 
     def acuity(self, **states: Unpack[States]) -> LabeledArray:
         """Return visual acuity in white light and the visual Strehl ratio.
@@ -546,3 +555,19 @@ class Eye:
         """Return transfers of the optics with the light that the media scatter."""
         scatter = self.straylight
         return (1.0 - scatter.fraction) * values + scatter.transfer_ratio(frequency_cpd)
+
+
+def _light(
+    white_light: bool, apodization: StilesCrawford | None, *, straylight: bool = False
+) -> dict[str, NDArray[Any]]:
+    """Return coordinates for what is not plain light of one wavelength."""
+    texts = {}
+    if white_light:
+        texts["light"] = "white"
+        apodization = StilesCrawford()
+    if apodization is not None:
+        is_centered = apodization.centre_mm == (0.0, 0.0)
+        texts["stiles_crawford"] = "centered" if is_centered else "decentered"
+    if straylight:
+        texts["straylight"] = "included"
+    return {name: np.array(text) for name, text in texts.items()}

@@ -45,6 +45,9 @@ def test_an_mtf_table_of_three_pupils_is_one_command():
     )
     assert found["eye"] == "emmetropia"
 
+    white = printed("mtf", "emmetropia", "--pupil-mm", "2", "--white-light")
+    assert "wavelength_nm 555, light white, stiles_crawford centered" in white
+
 
 @pytest.mark.long("five transfer functions and a figure")
 def test_options_of_light_change_the_mtf(tmp_path):

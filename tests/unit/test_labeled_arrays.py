@@ -317,3 +317,26 @@ def test_numbers_alone_give_results_without_axes():
     assert eye.acuity().dims == eye.refraction().dims == ("quantity",)
     assert eye.wavefront().dims == ("term",)
     assert eye.psf().dims == ("y_arcmin", "x_arcmin")
+
+
+@pytest.mark.long("transfer functions of four kinds of light")
+def test_coordinates_say_which_light_is_not_of_one_wavelength():
+    eye = Eye("emmetropia")
+
+    def light(**options):
+        found = eye.mtf(frequency_cpd=[10], pupil_diameter_mm=2, **options)
+        names = ("light", "stiles_crawford", "straylight")
+        return {k: found.coords[k].item() for k in names if k in found.coords}
+
+    assert light() == {}
+    assert light(white_light=True) == {"light": "white", "stiles_crawford": "centered"}
+    assert light(stiles_crawford=True) == {"stiles_crawford": "decentered"}
+    assert light(straylight=True) == {"straylight": "included"}
+    energy = eye.encircled_energy(
+        radius_arcmin=[1], white_light=True, pupil_diameter_mm=2
+    )
+    assert "light: white" in repr(energy)
+    assert dict(zip(energy.columns(), next(energy.rows()), strict=True))["light"] == (
+        "white"
+    )
+    assert eye.psf(white_light=True, pixel_arcmin=2).coords["light"] == "white"
