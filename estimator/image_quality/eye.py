@@ -40,7 +40,7 @@ from estimator.image_quality.traced_states import StateTracer
 from estimator.media import DEFAULT_AGE_YEARS, Straylight
 from estimator.optics.units import MRAD_PER_RAD
 from estimator.profiles.files import load_profile
-from estimator.profiles.parse import EyeProfile, parse_profile
+from estimator.profiles.parse import EyeProfile
 from estimator.psf.compute import disc_mask, plan_psfs
 from estimator.psf.stiles_crawford import StilesCrawford
 
@@ -113,9 +113,7 @@ class Eye:
     """
 
     def __init__(self, profile: EyeProfile | Mapping[str, Any] | str | Path):
-        if isinstance(profile, Mapping):
-            profile = parse_profile(profile)
-        elif not isinstance(profile, EyeProfile):
+        if not isinstance(profile, EyeProfile):
             profile = load_profile(profile)
         self.profile = profile
         self._tracer = StateTracer(profile)

@@ -1,7 +1,7 @@
 """Profile files: JSON, tables of coefficients, lens files, exports of instruments."""
 
 import codecs
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -66,19 +66,20 @@ class InvalidProfileFile(InvalidFile, ProfileError):
 
 
 def load_profile(
-    source: str | Path,
+    source: str | Path | Mapping[str, Any],
     *,
     pupil_diameter_mm: float | None = None,
     wavelength_nm: float | None = None,
 ) -> EyeProfile:
-    """Load a profile: a preset by name, a file, or JSON text.
+    """Load a profile: a preset by name, a file, JSON text, or a mapping.
 
     Parameters
     ----------
-    source : str or Path
+    source : str, Path or mapping
         Name of a preset (see `preset_names`) or of a schematic eye
         (`bodies.PUBLISHED_NAMES`), a ``.json``, ``.abp``, ``.csv``, ``.zmx`` or
-        ``.txt`` file, or a JSON object, ``{"kind": "prescription", "sphere_dpt": -2}``.
+        ``.txt`` file, or a JSON object, ``{"kind": "prescription", "sphere_dpt": -2}``,
+        as text or as a mapping.
     pupil_diameter_mm, wavelength_nm : float, optional
         Pupil and wavelength of a CSV file, which may instead contain them as
         ``# pupil_diameter_mm: 5`` lines, and wavelength of a ``.txt`` file.
@@ -99,7 +100,7 @@ def load_profile(
     except InvalidFile:
         raise
     except ProfileError as error:
-        if not _is_path(source):
+        if isinstance(source, Mapping) or not _is_path(source):
             raise
         raise InvalidProfileFile(
             source, error.field, error.problem, error.allowed
@@ -107,7 +108,7 @@ def load_profile(
 
 
 def profile_body(
-    source: str | Path,
+    source: str | Path | Mapping[str, Any],
     *,
     pupil_diameter_mm: float | None = None,
     wavelength_nm: float | None = None,
@@ -121,6 +122,8 @@ def profile_body(
     InvalidFile
         The file cannot be parsed; its fields are not validated here.
     """
+    if isinstance(source, Mapping):
+        return dict(source)
     for kind, names in NAMES.items():
         if str(source) in names:
             return {"kind": kind, "name": str(source)}

@@ -1,6 +1,7 @@
 """Profile parsing: what is accepted, and what an error names."""
 
 import json
+from types import MappingProxyType
 
 import numpy as np
 import pytest
@@ -195,6 +196,16 @@ def test_json_text_is_a_profile_wherever_one_is_loaded():
         load_profile(text).zernike_um,
         parse_profile({"kind": "prescription", "sphere_dpt": -2}).zernike_um,
     )
+
+
+def test_a_mapping_is_a_profile_wherever_one_is_loaded():
+    body = MappingProxyType({"kind": "prescription", "sphere_dpt": -2})
+    found, expected = load_profile(body), parse_profile(dict(body))
+    np.testing.assert_array_equal(found.zernike_um, expected.zernike_um)
+    with pytest.raises(ProfileError, match="sphere_dpt"):
+        load_profile({"kind": "prescription", "sphere_dpt": "strong"})
+    with pytest.raises(ProfileError):
+        load_profile({})
 
 
 @pytest.mark.parametrize("text", ["{", "{}", '{"kind": "guess"}', '{"a": ' * 5000])
