@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import math
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -35,6 +35,9 @@ DEFOCUS = "-2:2:0.25"
 FREQUENCY_LIMITS_CPD = (0.0, 1000.0)
 ORIENTATION_LIMITS_DEG = (-360.0, 360.0)
 DEFOCUS_LIMITS_DPT = (-20.0, 20.0)
+
+SHOWN_RATIO = 0.99
+"""Light that figures of PSFs show at least, of each PSF; the last 1 % is much wider."""
 
 
 @dataclass(frozen=True)
@@ -185,6 +188,7 @@ def print_psfs(
     out: Path | None,
     *,
     pixel_arcmin: float,
+    radius_arcmin: float | None,
     stiles_crawford: bool,
     as_csv: bool,
     json_output: bool,
@@ -198,12 +202,16 @@ def print_psfs(
     from filter_service.psfs.picture import half_light_radius_px
 
     found = Eye(eye).psf(
-        pixel_arcmin=pixel_arcmin, stiles_crawford=stiles_crawford, **states
+        pixel_arcmin=pixel_arcmin,
+        radius_arcmin=radius_arcmin,
+        stiles_crawford=stiles_crawford,
+        **states,
     )
     if out is not None and out.suffix.lower() == ".npy":
         replace_atomically(out, lambda part: write_image(part, found.values))
     elif out is not None:
-        figure = found.plot()
+        shown = found if radius_arcmin is not None else _within_light(found)
+        figure = shown.plot()
         replace_atomically(out, lambda part: figure.savefig(part, format="png"))
     kernels = found.values.reshape(-1, *found.shape[-2:])
     facts = [
@@ -226,6 +234,23 @@ def print_psfs(
     report(eye, table, as_csv=as_csv, json_output=json_output)
     if out is not None and not as_csv and not json_output:
         print_line(f"wrote {found.name} [{', '.join(found.dims)}] to {out}")
+
+
+def _within_light(found: LabeledArray) -> LabeledArray:
+    """Return PSFs cropped to the pixels that contain `SHOWN_RATIO` of the light."""
+    from filter_service.psfs.picture import light_radius_px
+
+    kernels = found.values.reshape(-1, *found.shape[-2:])
+    needed_px = max(light_radius_px(kernel, SHOWN_RATIO) for kernel in kernels)
+    middle_px = found.shape[-1] // 2
+    radius_px = min(math.ceil(needed_px), middle_px)
+    kept = slice(middle_px - radius_px, middle_px + radius_px + 1)
+    axes = ("y_arcmin", "x_arcmin")
+    return replace(
+        found,
+        values=found.values[..., kept, kept],
+        coords={k: v[kept] if k in axes else v for k, v in found.coords.items()},
+    )
 
 
 def _check(plot: Path | None) -> None:

@@ -346,6 +346,13 @@ def psf(
         str, typer.Option(metavar="LIST", help="Wavelengths, nm.")
     ],
     pixel_arcmin: Annotated[float, typer.Option(help="Pixel size, arcmin.")],
+    radius_arcmin: Annotated[
+        float | None,
+        typer.Option(
+            help="Radius of the disc of pixels; if not given, it has 99.9 % of the "
+            "light, and figures of lists show 99 %.  Requires --method auto."
+        ),
+    ] = None,
     out: Annotated[
         Path | None,
         typer.Option("--out", "-o", help="Output: .npy (kernel) or .png (log scale)."),
@@ -411,7 +418,11 @@ def psf(
     }
     states = states_of(PSF_LIMITS, **texts)
     check_range("--pixel-arcmin", pixel_arcmin, PIXEL_LIMITS_ARCMIN)
-    is_table = as_csv or any(isinstance(value, list) for value in states.values())
+    if radius_arcmin is not None:
+        limits = 0.0, MAX_RADIUS_PX * pixel_arcmin
+        check_range("--radius-arcmin", radius_arcmin, limits)
+    is_one = not any(isinstance(value, list) for value in states.values())
+    is_table = as_csv or radius_arcmin is not None or not is_one
 
     from filter_service.image_files import check_output
 
@@ -419,7 +430,9 @@ def psf(
         check_output(out, (".npy", ".png"))
     if is_table:
         if method != "auto":
-            raise ValueError(f"--method is {method!r}; lists and --csv allow: auto")
+            raise ValueError(
+                f"--method is {method!r}; lists, --radius-arcmin and --csv allow: auto"
+            )
         from clients.commands.image_quality import print_psfs
 
         print_psfs(
@@ -427,6 +440,7 @@ def psf(
             states,
             out,
             pixel_arcmin=pixel_arcmin,
+            radius_arcmin=radius_arcmin,
             stiles_crawford=stiles_crawford,
             as_csv=as_csv,
             json_output=json_output,

@@ -21,13 +21,30 @@ def half_light_radius_px(kernel: NDArray[np.float32]) -> float:
     ----------
     kernel : (2 R + 1, 2 R + 1), unit sum
     """
+    return light_radius_px(kernel, 0.5)
+
+
+def light_radius_px(kernel: NDArray[np.float32], share_ratio: float) -> float:
+    """Return the radius about the center element that contains a share of the light.
+
+    Parameters
+    ----------
+    kernel : (2 R + 1, 2 R + 1)
+    share_ratio : float
+        Share of the light of the kernel, above 0 and below 1.
+
+    Returns
+    -------
+    float
+        In pixels.
+    """
     radius_px = kernel.shape[0] // 2
     y, x = np.mgrid[-radius_px : radius_px + 1, -radius_px : radius_px + 1]
     distance_px = np.hypot(x, y).ravel()
     order = np.argsort(distance_px, kind="stable")
     light = np.cumsum(kernel.ravel()[order].astype(np.float64))
-    half = np.searchsorted(light, 0.5 * light[-1])
-    return float(distance_px[order][half])
+    last = np.searchsorted(light, share_ratio * light[-1])
+    return float(distance_px[order][last])
 
 
 def draw_psf(kernel: NDArray[np.float32], *, pixel_arcmin: float) -> NDArray[np.uint8]:

@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from clients.commands.image_quality import _within_light
 from clients.commands.state_options import listed_numbers
 from estimator import Eye
+from estimator.psf.compute import disc_mask
 from tests.commands import run_command
 
 PSF = ["--wavelength-nm", "555", "--pixel-arcmin", "1"]
@@ -105,6 +107,27 @@ def test_psfs_of_lists_are_a_table_and_one_array(tmp_path):
     assert np.asarray(Image.open(tmp_path / "psf.png")).shape[0] > 400
 
 
+@pytest.mark.long("PSFs of two states, twice")
+def test_psfs_have_the_stated_radius_and_figures_most_of_the_light(tmp_path):
+    out = tmp_path / "psf.npy"
+    words = ("psf", "emmetropia", "--pupil-mm", "3,6", *PSF)
+    rows = rows_of(printed(*words, "-o", out, "--radius-arcmin", "10", "--csv"))
+    kernels = np.load(out)
+    assert kernels.shape == (2, 21, 21)
+    assert {row["radius_arcmin"] for row in rows} == {"10.0"}
+    one = ("psf", "emmetropia", "--pupil-mm", "6", *PSF, "--radius-arcmin", "10")
+    printed(*one, "-o", out)
+    np.testing.assert_allclose(np.load(out), kernels[1], rtol=2e-3, atol=1e-6)
+
+    found = Eye("emmetropia").psf(pupil_diameter_mm=[3, 6], pixel_arcmin=1)
+    shown = _within_light(found)
+    assert shown.coords["x_arcmin"][-1] < 0.5 * found.coords["x_arcmin"][-1]
+    light = shown.values.sum(axis=(-1, -2))
+    assert (light >= 0.99).all()
+    smaller = shown.values[:, 2:-2, 2:-2] * disc_mask(shown.shape[-1] // 2 - 2)
+    assert smaller.sum(axis=(-1, -2)).min() < 0.99
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [
@@ -122,7 +145,12 @@ def test_psfs_of_lists_are_a_table_and_one_array(tmp_path):
         (
             "psf myopia --pupil-mm 3,4 --wavelength-nm 555 --pixel-arcmin 1 "
             "--method enz",
-            "--method is 'enz'; lists and --csv allow: auto",
+            "--method is 'enz'; lists, --radius-arcmin and --csv allow: auto",
+        ),
+        (
+            "psf myopia --pupil-mm 3 --wavelength-nm 555 --pixel-arcmin 1 "
+            "--radius-arcmin 2000",
+            "--radius-arcmin is 2000; allowed: 0 to 1023",
         ),
         ("mtf emmetropia --white-light --frequency-cpd 70", "expected 0 to 60"),
     ],
