@@ -15,8 +15,8 @@ EyeName = Annotated[
     str,
     typer.Argument(
         metavar="EYE",
-        help="Name of a preset or schematic eye, or a .json, .abp, .csv or .zmx "
-        "profile.",
+        help="Name of a preset or schematic eye, a .json, .abp, .csv or .zmx profile, "
+        'or JSON text such as \'{"kind": "prescription", "sphere_dpt": -2}\'.',
     ),
 ]
 
