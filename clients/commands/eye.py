@@ -20,7 +20,8 @@ from clients.commands.optics import (
     Wavelength,
     ellipse_facts,
 )
-from clients.commands.state_options import listed_numbers
+from clients.commands.state_options import EyeName, listed_numbers
+from estimator.optics.units import REFERENCE_WAVELENGTH_NM
 from filter_service.command_line import (
     CommandFailed,
     Json,
@@ -34,13 +35,6 @@ if TYPE_CHECKING:
     from estimator.field.field_table import DrawnFields, FieldTable
     from estimator.profiles.eye_profile import EyeProfile
 
-Profile = Annotated[
-    str,
-    typer.Argument(
-        metavar="PROFILE",
-        help="Preset name, or a .json, .abp, .csv or .zmx profile.",
-    ),
-]
 TIME_LIMITS_S = (0.1, 86400.0)
 
 
@@ -48,7 +42,7 @@ Method = Literal["network", "refined", "search"]
 
 
 def estimate(
-    profile: Profile,
+    eye: EyeName,
     method: Annotated[
         Method,
         typer.Option(
@@ -83,9 +77,9 @@ def estimate(
 
     if plot is not None:
         check_output(plot, (".png",))
-    eye = load_profile(profile)
+    profile = load_profile(eye)
     try:
-        found = estimate_eye(eye, method=method, max_time_s=max_time_s)
+        found = estimate_eye(profile, method=method, max_time_s=max_time_s)
     except (WeightsMissing, DamagedWeights) as error:  # not the user's input
         raise CommandFailed(str(error)) from error
     if plot is not None:
@@ -119,6 +113,8 @@ def _summary(found: "EstimatedEye") -> dict[str, Any]:
         "on_bound": list(found.on_bound),
         "determined_ratio": found.determined_ratio,
         "refraction_dpt": found.refraction_dpt,
+        "refraction_wavelength_nm": REFERENCE_WAVELENGTH_NM,
+        "refraction_pupil_diameter_mm": profile.pupil_diameter_mm,
         "amplitude_dpt": found.amplitude_dpt,
         "notes": [*found.notes, *profile.notes],
     }
@@ -139,8 +135,10 @@ def _report(summary: dict[str, Any], plot: Path | None) -> None:
         f"{summary['profile']}, {summary['method']}: mean error "
         f"{summary['mean_abs_error_um']:.2g} um over 25 terms, "
         f"{summary['time_ms']:.0f} ms, {summary['n_evaluations']} eyes traced; "
-        f"refraction {summary['refraction_dpt']:.2f} dpt, amplitude of "
-        f"accommodation {summary['amplitude_dpt']:.1f} dpt"
+        f"refraction {summary['refraction_dpt']:.2f} dpt at "
+        f"{summary['refraction_wavelength_nm']:g} nm through "
+        f"{summary['refraction_pupil_diameter_mm']:g} mm, amplitude of accommodation "
+        f"{summary['amplitude_dpt']:.1f} dpt"
     )
     if plot is not None:
         print_line(f"wrote the cross-section to {plot}")
@@ -155,7 +153,7 @@ HORIZONTAL, VERTICAL = "-40,-30,-20,-10,0,10,20,30,40", "0"
 
 
 def field(
-    profile: Profile,
+    eye: EyeName,
     pupil_mm: Pupil,
     wavelength_nm: Wavelength,
     h_deg: Annotated[
@@ -237,9 +235,9 @@ def field(
 
     if plot is not None:
         check_output(plot, (".png",))
-    eye = load_profile(profile)
+    profile = load_profile(eye)
     if people is not None:
-        drawn_profiles(eye, people)  # fail early
+        drawn_profiles(profile, people)  # fail early
     across, along = np.meshgrid(azimuths, elevations)
     states: dict[str, Any] = {
         "h_deg": across.ravel(),
@@ -248,20 +246,22 @@ def field(
         "wavelength_nm": wavelength_nm,
         "focus_dpt": focus_dpt,
     }
-    found, drawn = field_table(eye, **states), None
+    found, drawn = field_table(profile, **states), None
     notes = list(found.notes)
     if people is not None:
-        drawn = _drawn(eye, people, states, quiet=json_output)
-        notes.append(f"{people} persons: {drawn_text(eye)}")
+        drawn = _drawn(profile, people, states, quiet=json_output)
+        # The biometry of the mean eye is not that of the persons.
+        notes = [n for n in notes if getattr(n, "code", "") != "drawn_eye"]
+        notes.append(f"{people} persons: {drawn_text(profile)}")
     if plot is not None:
         from estimator.field.field_figure import plot_field
 
-        title = f"{eye.name}, {pupil_mm:g} mm"
+        title = f"{profile.name}, {pupil_mm:g} mm"
         write = partial(plot_field, found, title=title, drawn=drawn)
         replace_atomically(plot, write, is_private=True)
-    if eye.correction is not None:
+    if profile.correction is not None:
         notes.append("seen through the correction")
-    if rings_of(eye.correction) is not None:
+    if rings_of(profile.correction) is not None:
         notes.append(
             "coefficients cannot represent the rings or lenslets of the correction: "
             "they describe its distance power"
@@ -278,7 +278,7 @@ def field(
         return
     for note in notes:
         print_line(f"note: {note}")
-    print_line(f"{eye.name}, entrance pupil diameter {pupil_mm:g} mm")
+    print_line(f"{profile.name}, entrance pupil diameter {pupil_mm:g} mm")
     if drawn is None:
         _print_table(found)
     else:
@@ -286,7 +286,7 @@ def field(
 
 
 def _drawn(
-    eye: "EyeProfile", people: int, states: dict[str, Any], *, quiet: bool
+    profile: "EyeProfile", people: int, states: dict[str, Any], *, quiet: bool
 ) -> "DrawnFields":
     """Return the fields of drawn persons; show progress on a terminal."""
     from estimator.field.field_table import drawn_fields
@@ -294,7 +294,7 @@ def _drawn(
 
     with Progress(quiet=quiet or not sys.stderr.isatty()) as progress:
         task = progress.task("Drawn persons", total=people, unit="persons")
-        return drawn_fields(eye, people, progress=task.advance, **states)
+        return drawn_fields(profile, people, progress=task.advance, **states)
 
 
 def _directions(found: "FieldTable") -> list[dict[str, Any]]:
