@@ -138,10 +138,12 @@ def vertex_notes(
         notes.append(_vertex_note("prescription", eye))
     if isinstance(correction, SPECTACLES):
         notes.append(_vertex_note("worn spectacles", correction))
+    if isinstance(correction, ContactLensBody):
+        notes.append(_vertex_note("worn contact lens", correction))
     return tuple(note for note in notes if note)
 
 
-def _vertex_note(name: str, body: "VertexBody") -> str:
+def _vertex_note(name: str, body: "VertexBody | ContactLensBody") -> str:
     lens = prescription(body, path="")
     meridians_dpt = lens.sphere_dpt, lens.sphere_dpt + lens.cylinder_dpt
     strongest_dpt = max(map(abs, meridians_dpt))
@@ -155,7 +157,8 @@ def _vertex_note(name: str, body: "VertexBody") -> str:
     note = f"{name}: {rx.format_prescription(lens)} {place}"
     if 0.0 < lens.vertex_mm < LEAST_VERTEX_MM:
         note += "; is vertex_mm in mm? Spectacles usually have 12 to 14 mm"
-    if body.vertex_mm is UNSET and strongest_dpt >= ASKS_FROM_DPT:
+    asks = not isinstance(body, ContactLensBody) and body.vertex_mm is UNSET
+    if asks and strongest_dpt >= ASKS_FROM_DPT:
         note += (
             "; vertex_mm is missing: the powers of spectacles need it, usually "
             "12 to 14 mm"
@@ -169,13 +172,14 @@ def _vertex_note(name: str, body: "VertexBody") -> str:
     )
 
 
-def prescription(body: "VertexBody", *, path: str) -> rx.Prescription:
+def prescription(body: "VertexBody | ContactLensBody", *, path: str) -> rx.Prescription:
     """Return sphere, cylinder, axis and the distance in front of the cornea."""
+    given_mm = UNSET if isinstance(body, ContactLensBody) else body.vertex_mm
     return rx.Prescription(
         sphere_dpt=body.sphere_dpt,
         cylinder_dpt=body.cylinder_dpt,
         axis_deg=_axis_deg(body, path=path),
-        vertex_mm=0.0 if body.vertex_mm is UNSET else body.vertex_mm,
+        vertex_mm=0.0 if given_mm is UNSET else given_mm,
     )
 
 

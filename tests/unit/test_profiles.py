@@ -155,6 +155,9 @@ def test_powers_are_said_where_they_count_and_at_the_cornea():
     # 5 to 5.376
     expected = "worn spectacles: +5.00 at 14 mm, +5.38 at the cornea"
     assert parse_profile(worn).notes == (expected,)
+    lens = {"kind": "contact_lens", "sphere_dpt": -5, "cylinder_dpt": -1, "axis_deg": 9}
+    expected = "worn contact lens: -5.00 -1.00 x 9 at the cornea"
+    assert parse_profile({**GOOD, "correction": lens}).notes == (expected,)
 
 
 @pytest.mark.parametrize(
