@@ -492,7 +492,7 @@ class ZernikeBody(WavefrontBody, kw_only=True, tag_field="kind", tag="zernike"):
     zernike_um: CoefficientsUm | UnsetType = UNSET
     pupil_diameter_mm: PupilDiameterMm | UnsetType = UNSET
     wavelength_nm: WavelengthNm
-    frame: Frame = "eye"
+    frame: Frame | UnsetType = UNSET
     zernike: OrderedZernike | UnsetType = UNSET
     pupil_radius_mm: PupilRadiusMm | UnsetType = UNSET
 

@@ -281,11 +281,14 @@ def _normalization(given: OrderedZernikeBody) -> str:
 
 def order_notes(
     body: CoefficientsOnACircle,
-    frame: str,
+    frame: str | UnsetType,
     zernike_um: NDArray[np.float64],
     pupil_diameter_mm: float,
 ) -> tuple[Note, ...]:
-    """Return a note on how coefficients with a stated order were read, in words."""
+    """Return a note on how coefficients with a stated order were read, in words.
+
+    A frame that is not stated is the eye's.
+    """
     if body.zernike is UNSET:
         return ()
     given = body.zernike
@@ -293,12 +296,19 @@ def order_notes(
     if unit == "waves":
         unit += f" of {body.wavelength_nm:g} nm"
     norm = "" if _normalization(given) == "rms" else "not "
-    side = "person" if frame == "eye" else "examiner"
+    side = "examiner" if frame == "examiner" else "person"
+    unstated = ""
+    if frame is UNSET:
+        unstated = (
+            " (no frame stated: read as the eye's view; papers with the OSA standard "
+            "mean the examiner's)"
+        )
     words = describe_zernike(zernike_um, pupil_diameter_mm=pupil_diameter_mm)
     note = Note(
         "zernike_order",
         f"coefficients by {ORDER_NAMES[given.order]}, {norm}normalized to RMS 1, in "
-        f"{unit}, positive where light is {given.positive}, x to the {side}'s right, "
+        f"{unit}, positive where light is {given.positive}, x to the {side}'s right"
+        f"{unstated}, "
         f"on a circle of {pupil_diameter_mm:.4g} mm: {'; '.join(words) or 'all 0'}",
         pupil_diameter_mm=pupil_diameter_mm,
         wavelength_nm=body.wavelength_nm,

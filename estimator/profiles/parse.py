@@ -240,7 +240,8 @@ def _primary(first: Measurement, *others: Measurement) -> dict[str, Any]:
 
 
 def _zernike(body: bodies.ZernikeBody) -> EyeProfile:
-    zernike_um, pupil_mm = measured_um(body, body.frame, path="")
+    frame = "eye" if body.frame is msgspec.UNSET else body.frame
+    zernike_um, pupil_mm = measured_um(body, frame, path="")
     common = common_fields(body, "zernike")
     common["notes"] += order_notes(body, body.frame, zernike_um, pupil_mm)
     return EyeProfile(
@@ -257,15 +258,17 @@ def _zernike_set(body: bodies.ZernikeSetBody) -> EyeProfile:
     notes: tuple[Note, ...] = ()
     for number, entry in enumerate(body.measurements):
         frame = body.frame if entry.frame is msgspec.UNSET else entry.frame
-        side = "eye" if frame is msgspec.UNSET else frame
-        zernike_um, pupil_mm = measured_um(entry, side, path=f"measurements.{number}.")
+        stated = "eye" if frame is msgspec.UNSET else frame
+        zernike_um, pupil_mm = measured_um(
+            entry, stated, path=f"measurements.{number}."
+        )
         measurements.append(
             Measurement(
                 zernike_um, pupil_mm, entry.wavelength_nm, entry.h_deg, entry.v_deg
             )
         )
         if measurements[-1].is_on_axis:  # a set has many others
-            notes += order_notes(entry, side, zernike_um, pupil_mm)
+            notes += order_notes(entry, frame, zernike_um, pupil_mm)
     measurements, repeats = merged_repeats(measurements)
     on_axis = [m for m in measurements if m.is_on_axis]
     if not on_axis:

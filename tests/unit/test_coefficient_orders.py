@@ -53,6 +53,10 @@ def test_a_list_in_each_order_for_both_eyes_and_views(order, frame, eye_side):
     assert note.code == "zernike_order"
     assert note.values == {"pupil_diameter_mm": 6.0, "wavelength_nm": 555.0}
     assert ("x to the examiner's right" in note) == (frame == "examiner")
+    assert "no frame stated" not in note
+    unstated = parse_profile({**BODY, "eye_side": eye_side, "zernike": stated})
+    said = "x to the person's right (no frame stated: read as the eye's view; "
+    assert said in unstated.notes[0]
     assert ", in waves of 555 nm, positive where light is ahead, " in note
     is_rms = DEFAULT_NORMALIZATION[order] == "rms"
     assert f", {'' if is_rms else 'not '}normalized to RMS 1, " in note
