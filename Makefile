@@ -124,7 +124,7 @@ clean:  ## remove generated files, including .venv but not out/
 help:  ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*  ## \(.*\)/  make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 32
 
-setup:
+setup:  ## create .venv with pinned packages and compile the C libraries
 	@sh setup.sh
 
 setup-test:
