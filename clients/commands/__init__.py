@@ -11,7 +11,7 @@ eye            estimate and field: an eye and its visual field
 optics         wavefront and psf: an eye in one direction
 coefficients   coefficients in other orders, as wavefront and estimate print them
 eye_bank       bank: prebuilt eyes of many persons
-image_quality  mtf, acuity and through-focus: an eye in lists of states
+image_quality  mtf, acuity, refraction and through-focus: an eye in lists of states
 state_options  options of such lists
 checkout       bench and paper, which need a checkout
 doctor         doctor: checks of this machine

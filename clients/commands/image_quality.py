@@ -1,4 +1,4 @@
-"""`ocufilter mtf`, `acuity`, `through-focus` and lists of `psf`: an eye in states."""
+"""`ocufilter mtf`, `acuity`, `refraction`, `through-focus`, and lists of `psf`."""
 
 from __future__ import annotations
 
@@ -8,13 +8,18 @@ import sys
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
 from clients.commands.options import with_options
-from clients.commands.state_options import EyeName, StateOptions, listed_numbers
-from filter_service.command_line import Json, print_json, print_line
+from clients.commands.state_options import (
+    EyeName,
+    StateOptions,
+    ViewOptions,
+    listed_numbers,
+)
+from filter_service.command_line import Json, check_range, print_json, print_line
 
 if TYPE_CHECKING:
     from estimator import LabeledArray
@@ -35,6 +40,7 @@ DEFOCUS = "-2:2:0.25"
 FREQUENCY_LIMITS_CPD = (0.0, 1000.0)
 ORIENTATION_LIMITS_DEG = (-360.0, 360.0)
 DEFOCUS_LIMITS_DPT = (-20.0, 20.0)
+VERTEX_LIMITS_MM = (0.0, 50.0)
 
 SHOWN_RATIO = 0.99
 """Light that figures of PSFs show at least, of each PSF; the last 1 % is much wider."""
@@ -80,6 +86,26 @@ class ThroughFocusOptions(StateOptions):
     frequency_cpd: Annotated[
         float, typer.Option(help="Frequency of the modulation, cycles per degree.")
     ] = 15.0
+
+
+@dataclass(frozen=True)
+class RefractionOptions(ViewOptions):
+    """Options of `ocufilter refraction`."""
+
+    focus_dpt: Annotated[
+        str | None,
+        typer.Option(metavar="LIST", help="Focus, dpt; relaxed if not given."),
+    ] = None
+    method: Annotated[
+        Literal["least_squares", "visual_strehl"],
+        typer.Option(
+            help="least_squares: the lens that makes the wavefront flattest; "
+            "visual_strehl: the lens with the highest visual Strehl ratio."
+        ),
+    ] = "least_squares"
+    vertex_mm: Annotated[
+        float, typer.Option(help="Distance of the lens from the cornea, mm.")
+    ] = 0.0
 
 
 @with_options
@@ -148,6 +174,35 @@ def acuity(
 
     found = Eye(eye).acuity(**states)
     report(eye, found, as_csv=as_csv, plot=plot, json_output=json_output)
+
+
+@with_options
+def refraction(
+    eye: EyeName,
+    options: RefractionOptions,
+    as_csv: Csv = False,
+    json_output: Json = False,
+) -> None:
+    """Print the refraction: the lens that corrects an eye for infinity.
+
+    Sphere, minus cylinder and axis are as the examiner writes them, for a lens at
+    --vertex-mm.  M, J0 and J45 are the power vector in that plane, in the eye's frame:
+    J45 has the opposite sign in the examiner's.  A correction in the profile is worn:
+    the result is what it lacks.  All combinations of the lists are computed.  A LIST is
+    numbers separated by commas, or first:last:step.
+
+    ocufilter refraction keratoconus --pupil-mm 3,5
+    """
+    arguments = {
+        **options.states(),
+        "method": options.method,
+        "vertex_mm": options.vertex_mm,
+    }
+    check_range("--vertex-mm", options.vertex_mm, VERTEX_LIMITS_MM)
+    from estimator import Eye
+
+    found = Eye(eye).refraction(**arguments)
+    report(eye, found, as_csv=as_csv, json_output=json_output)
 
 
 @with_options

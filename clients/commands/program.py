@@ -89,6 +89,10 @@ COMMANDS = {
         "clients.commands.image_quality:acuity",
         "Print visual acuity and the visual Strehl ratio.",
     ),
+    "refraction": (
+        "clients.commands.image_quality:refraction",
+        "Print the lens that corrects an eye for infinity.",
+    ),
     "through-focus": (
         "clients.commands.image_quality:through_focus",
         "Print acuity and modulation by defocus.",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Annotated, Any
 
 import typer
@@ -31,8 +31,8 @@ FORM = "numbers separated by commas, or first:last:step"
 
 
 @dataclass(frozen=True)
-class StateOptions:
-    """States of an eye; each option is a list."""
+class ViewOptions:
+    """Pupils, wavelengths and directions of an eye; each option is a list."""
 
     pupil_mm: Annotated[
         str, typer.Option(metavar="LIST", help="Entrance pupils at 555 nm, mm.")
@@ -48,6 +48,23 @@ class StateOptions:
         str,
         typer.Option(metavar="LIST", help="Elevations of the source; positive is up."),
     ] = "0"
+
+    def states(self) -> dict[str, Any]:
+        """Return the arguments of the methods of `Eye`.
+
+        Raises
+        ------
+        ValueError
+            A value is no number or out of range.
+        """
+        lists = [field.name for field in fields(self) if field.name in LIMITS]
+        return states_of(LIMITS, **{name: getattr(self, name) for name in lists})
+
+
+@dataclass(frozen=True)
+class StateOptions(ViewOptions):
+    """States of an eye; each option is a list."""
+
     focus_dpt: Annotated[
         str | None,
         typer.Option(metavar="LIST", help="Focus, dpt; infinity if not given."),
@@ -58,24 +75,6 @@ class StateOptions:
             metavar="LIST", help="Distances of the source, dpt; 0 is infinity."
         ),
     ] = "0"
-
-    def states(self) -> dict[str, Any]:
-        """Return the arguments of the methods of `Eye`.
-
-        Raises
-        ------
-        ValueError
-            A value is no number or out of range.
-        """
-        return states_of(
-            LIMITS,
-            pupil_mm=self.pupil_mm,
-            wavelength_nm=self.wavelength_nm,
-            h_deg=self.h_deg,
-            v_deg=self.v_deg,
-            focus_dpt=self.focus_dpt,
-            object_dpt=self.object_dpt,
-        )
 
 
 LIMITS = {

@@ -507,8 +507,9 @@ class Eye:
         """Return the refraction: the lens that corrects the eye for infinity.
 
         The axis ``quantity`` has sphere, minus cylinder and axis as the examiner writes
-        them, and the power vector M, J0 and J45.  A correction in the profile is worn:
-        the result is what it lacks.
+        them, and the power vector M, J0 and J45 in the eye's frame, where J45 has the
+        opposite sign.  A correction in the profile is worn: the result is what it
+        lacks.
 
         Parameters
         ----------

@@ -90,6 +90,22 @@ def test_acuity_and_through_focus_have_a_column_for_each_quantity():
     assert list(rows[0])[-3:] == ["log_mar", "visual_strehl_ratio", "modulation_ratio"]
 
 
+def test_refraction_is_the_prescription_with_wavelength_and_pupil():
+    body = {"kind": "prescription", "higher_order": "none", "vertex_mm": 12}
+    body |= {"sphere_dpt": -3, "cylinder_dpt": -1, "axis_deg": 30}
+    words = ("refraction", json.dumps(body), "--pupil-mm", "3,5", "--vertex-mm", "12")
+    rows = rows_of(printed(*words, "--csv"))
+    assert [float(row["pupil_diameter_mm"]) for row in rows] == [3.0, 5.0]
+    for row in rows:
+        found = [float(row[k]) for k in ("sphere_dpt", "cylinder_dpt", "axis_deg")]
+        assert found == pytest.approx([-3.0, -1.0, 30.0], abs=0.02)
+        # M = S + C / 2; J0, J45 = -C / 2 cos, sin of twice 180 - axis: eye's frame
+        found = [float(row[k]) for k in ("M_dpt", "J0_dpt", "J45_dpt")]
+        assert found == pytest.approx([-3.5, 0.25, -0.25 * 3**0.5], abs=0.02)
+    text = printed("refraction", "emmetropia", "--method", "visual_strehl")
+    assert "pupil_diameter_mm 4, wavelength_nm 555, vertex_mm 0" in text
+
+
 @pytest.mark.long("PSFs of six states and their figure")
 def test_psfs_of_lists_are_a_table_and_one_array(tmp_path):
     out = tmp_path / "psf.npy"
@@ -152,6 +168,7 @@ def test_psfs_have_the_stated_radius_and_figures_most_of_the_light(tmp_path):
             "--radius-arcmin 2000",
             "--radius-arcmin is 2000; allowed: 0 to 1023",
         ),
+        ("refraction emmetropia --vertex-mm 60", "--vertex-mm is 60; allowed: 0 to 50"),
         ("mtf emmetropia --white-light --frequency-cpd 70", "expected 0 to 60"),
     ],
 )
