@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from itertools import product
 
 from clients.batch.source import CENTER, Constant, SourceFrame, States
-from clients.commands.options import read_numbers
+from clients.commands.state_options import listed_numbers
 from filter_service.settings import MAX_PUPIL_MM, MAX_VERGENCE_DPT, MIN_PUPIL_MM
 
 DISTANCE_LIMITS_M = (1.0 / MAX_VERGENCE_DPT, math.inf)
@@ -42,22 +42,26 @@ class Views:
         """
         distances_dpt: tuple[float, ...] = ()
         if distance_m is not None:
-            distances_m = read_numbers("--distance-m", distance_m, DISTANCE_LIMITS_M)
+            distances_m = listed_numbers(
+                "--distance-m", distance_m, DISTANCE_LIMITS_M, is_distinct=True
+            )
             distances_dpt = tuple(1.0 / one_m for one_m in distances_m)
         parts = focus_dpt.split(",")
         numbers = [part for part in parts if part != CENTER]
-        foci_dpt: tuple[float | None, ...] = ()
+        foci_dpt: list[float | None] = []
         if numbers:
-            foci_dpt = read_numbers(
+            foci_dpt += listed_numbers(
                 "--focus-dpt",
                 ",".join(numbers),
                 (0.0, MAX_VERGENCE_DPT),
+                is_distinct=True,
                 other=CENTER,
             )
         if CENTER in parts:
-            foci_dpt = (*foci_dpt, None)
-        pupils_mm = read_numbers("--pupil-mm", pupil_mm, (MIN_PUPIL_MM, MAX_PUPIL_MM))
-        return cls(distances_dpt, pupils_mm, foci_dpt)
+            foci_dpt.append(None)
+        limits = MIN_PUPIL_MM, MAX_PUPIL_MM
+        pupils_mm = listed_numbers("--pupil-mm", pupil_mm, limits, is_distinct=True)
+        return cls(distances_dpt, tuple(pupils_mm), tuple(foci_dpt))
 
     @property
     def count(self) -> int:

@@ -19,7 +19,6 @@ import numpy as np
 import typer
 
 from estimator.bounded_files import InvalidFile, loads_bounded, printable, read_text
-from filter_service.command_line import check_range, likely_number
 from filter_service.displays import primaries_of_spectra
 from filter_service.errors import BadMessage
 from filter_service.settings import DEFAULTS, setting_help, setting_types
@@ -230,39 +229,6 @@ def profile_title(profile: Mapping[str, Any]) -> str:
     """Return a profile's name, or its kind, as text for a message."""
     name = str(profile.get("name", profile.get("kind")))
     return printable(name, most=MAX_TITLE_CHARACTERS)
-
-
-def read_numbers(
-    option: str, text: str, limits: tuple[float, float], *, other: str = ""
-) -> tuple[float, ...]:
-    """Return different numbers from text such as ``3`` or ``3,5``.
-
-    Parameters
-    ----------
-    other : str
-        Word that the option also allows, for error messages.
-
-    Raises
-    ------
-    ValueError
-        If a part is not a number, is out of range, or occurs twice.  The message names
-        the option, the value and the range.
-    """
-    found: list[float] = []
-    for part in text.split(","):
-        try:
-            value = float(part)
-        except ValueError:
-            raise ValueError(
-                f"{option} is '{text:.60}'{likely_number(part)}"
-                + (f", or {other}" if other else "")
-            ) from None
-        check_range(option, value, limits)
-        if value in found:
-            allowed = "each value once"
-            raise ValueError(f"{option} is '{text:.60}'; allowed: {allowed}")
-        found.append(value)
-    return tuple(found)
 
 
 def read_object(option: str, text: str) -> dict[str, Any]:

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
-from filter_service.command_line import check_range
+from filter_service.command_line import check_range, likely_number
 
 EyeName = Annotated[
     str,
@@ -113,47 +113,65 @@ def states_of(
     return found
 
 
-def listed_numbers(option: str, text: str, limits: tuple[float, float]) -> list[float]:
+def listed_numbers(
+    option: str,
+    text: str,
+    limits: tuple[float, float],
+    *,
+    is_distinct: bool = False,
+    other: str = "",
+) -> list[float]:
     """Parse a list: numbers separated by commas, or first:last:step.
+
+    Parameters
+    ----------
+    option : str
+    text : str
+    limits : (float, float)
+        Smallest and largest number; they may be infinite.
+    is_distinct : bool
+        Whether each number may occur only once.
+    other : str
+        Word that the option also allows, for error messages.
 
     Raises
     ------
     ValueError
         A number is invalid.  The message names the option, the value and the range.
     """
-    words = text.replace(",", " ").split()
-    if not words:
-        raise ValueError(f"{option} is empty; allowed: {FORM}")
     found: list[float] = []
-    for word in words:
-        parts = [_number(option, part) for part in word.split(":")]
-        if len(parts) == 1:
-            found += parts
-        elif len(parts) == 3 and parts[2] != 0.0:
-            first, last, step = parts
-            count = math.floor((last - first) / step + 1e-9) + 1
-            if not 1 <= count <= MAX_NUMBERS:
-                raise ValueError(
-                    f"{option} is {word!r}: {max(count, 0)} numbers; allowed: 1 to "
-                    f"{MAX_NUMBERS}"
-                )
-            found += [round(first + k * step, 9) for k in range(count)]
-        else:
-            raise ValueError(f"{option} is {word!r}; allowed: {FORM}")
+    words = [
+        (word, cell) for cell in text.split(",") for word in cell.split() or [cell]
+    ]
+    for word, cell in words:
+        try:
+            parts = [float(part) for part in word.split(":")]
+        except ValueError:
+            raise ValueError(
+                f"{option} is '{text:.60}'{likely_number(cell)}"
+                + (f", or {other}" if other else "")
+            ) from None
+        found += parts if len(parts) == 1 else _range(option, word, parts)
     if len(found) > MAX_NUMBERS:
         raise ValueError(
             f"{option}: {len(found)} numbers; allowed: at most {MAX_NUMBERS}"
         )
     for value in found:
         check_range(option, value, limits)
+    if is_distinct and len(set(found)) < len(found):
+        raise ValueError(f"{option} is '{text:.60}'; allowed: each value once")
     return found
 
 
-def _number(option: str, word: str) -> float:
-    try:
-        value = float(word)
-    except ValueError:
-        value = math.nan
-    if not math.isfinite(value):
-        raise ValueError(f"{option} is {word!r}; allowed: {FORM}")
-    return value
+def _range(option: str, word: str, parts: list[float]) -> list[float]:
+    """Return the numbers of first:last:step."""
+    if len(parts) != 3 or parts[2] == 0.0 or not all(map(math.isfinite, parts)):
+        raise ValueError(f"{option} is '{word:.60}'; allowed: {FORM}")
+    first, last, step = parts
+    count = math.floor((last - first) / step + 1e-9) + 1
+    if not 1 <= count <= MAX_NUMBERS:
+        raise ValueError(
+            f"{option} is '{word:.60}': {max(count, 0)} numbers; allowed: 1 to "
+            f"{MAX_NUMBERS}"
+        )
+    return [round(first + k * step, 9) for k in range(count)]

@@ -11,7 +11,8 @@ import typer
 from clients.batch.options import ImageSetOptions, check_options
 from clients.batch.source import CENTER
 from clients.batch.views import Views
-from clients.commands.options import read_numbers, read_size_px
+from clients.commands.options import read_size_px
+from clients.commands.state_options import listed_numbers
 from clients.stimuli.display import (
     PIXEL_LIMITS_ARCMIN,
     SCREEN_LIMITS_MM,
@@ -221,4 +222,5 @@ def numbers(name: str, text: str | None) -> tuple[float, ...]:
     """Return the numbers of an option, which stimuli check; none if it is not given."""
     if text is None:
         return ()
-    return read_numbers(f"--{name.replace('_', '-')}", text, (-1e6, 1e6))
+    option = f"--{name.replace('_', '-')}"
+    return tuple(listed_numbers(option, text, (-1e6, 1e6), is_distinct=True))

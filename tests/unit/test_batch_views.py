@@ -56,6 +56,7 @@ def test_several_views_are_all_combinations_in_folders_of_their_values():
         (("4", "3,12", "0"), "--pupil-mm is 12; allowed: 0.5 to 9"),
         (("4", "3,3", "0"), "'3,3'; allowed: each value once"),
         (("4", "3,", "0"), "--pupil-mm is '3,'; allowed: a number"),
+        (("inf:1:1", "3", "0"), "--distance-m is 'inf:1:1'; allowed: numbers"),
         (("4", "3mm", "0"), "without 'mm', as in 3"),
         (("0.01", "3", "0"), "--distance-m is 0.01; allowed: 0.05 to inf"),
         (("4", "3", "near"), "--focus-dpt is 'near'; allowed: a number"),
@@ -176,3 +177,9 @@ def test_one_command_filters_photographs_through_people_and_pupils(
     assert np.abs(wide - other).max() > 0
     finished = run_command(*arguments)  # resumes: nothing is missing
     assert "8 of 8 images, 0 of them in this run" in finished.stdout
+
+
+def test_a_range_is_the_list_of_its_numbers():
+    assert Views.of("inf,1:3:1", "3:5:1", "0:1:0.5,center") == Views.of(
+        "inf,1,2,3", "3,4,5", "0,0.5,1,center"
+    )

@@ -193,7 +193,9 @@ def test_a_list_is_numbers_or_a_range(text, values):
     assert listed_numbers("--x-dpt", text, (-10.0, 10.0)) == values
 
 
-@pytest.mark.parametrize("text", ["", "0:1:0", "1:0:1", "0:1e9:1e-9", "nan", "1:2:3:4"])
+@pytest.mark.parametrize(
+    "text", ["", "3,", "inf:0:1", "0:1:0", "1:0:1", "0:1e9:1e-9", "nan", "1:2:3:4"]
+)
 def test_other_lists_are_refused(text):
     with pytest.raises(ValueError, match="--x-dpt is"):
         listed_numbers("--x-dpt", text, (-10.0, 10.0))
