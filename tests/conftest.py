@@ -18,7 +18,7 @@ np.seterr(divide="raise", over="raise", invalid="raise", under="ignore")
 
 SESSION_GPU = pytest.StashKey()
 
-MOST_LONG_CASES = 100
+MOST_LONG_CASES = 160
 """Of one collection: what `make test` may hold of cases longer than the budget."""
 
 ENGINES = ("native", "gl")

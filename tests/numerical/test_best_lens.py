@@ -21,7 +21,7 @@ CAMERA = Camera.from_fov(1.6, width_px=WIDTH_PX, height_px=HEIGHT_PX)
 SETTINGS = {"mode": "on-axis", "eye_model": "wavefront"}
 BUILDER = {}
 
-pytestmark = pytest.mark.long("searches of 15 lenses or more")
+long = pytest.mark.long("searches of 15 lenses or more")
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -55,6 +55,7 @@ def power_of(lens):
     return np.array(power_vector(lens))
 
 
+@long
 @pytest.mark.parametrize(
     ("sphere_dpt", "lens"),
     [
@@ -90,6 +91,7 @@ def test_an_astigmatic_eye_gets_its_cylinder_and_axis():
 OFFSETS_DPT = (-0.3, -0.15, -0.05, 0.05, 0.15, 0.3)
 
 
+@long
 def test_no_lens_of_a_grid_is_better():
     wavefront = {"2,0": 1.0, "4,0": 0.25, "6,0": -0.05}
     eye = {"kind": "zernike", "zernike_um": wavefront, "age_years": 60}
@@ -126,6 +128,7 @@ def test_accommodation_does_not_compensate_a_lens():
     assert young.best.prescription == old.best.prescription
 
 
+@long
 def test_reading_glasses_of_an_eye_that_does_not_accommodate():
     eye = prescription(0.0, age_years=60)
     near = scene(0.4)
@@ -172,6 +175,7 @@ def test_a_progressive_lens_gets_its_addition():
     assert best.rounded.add_dpt % 0.25 == 0.0
 
 
+@long
 def test_what_another_eye_sees_needs_the_difference_of_their_lenses():
     best = found(
         prescription(-3.0, higher_order="none"),
@@ -185,6 +189,7 @@ def test_what_another_eye_sees_needs_the_difference_of_their_lenses():
     assert np.mean((best.after - best.target) ** 2) < 1e-4
 
 
+@long
 def test_progress_and_the_course_are_told():
     told = []
     best = found(

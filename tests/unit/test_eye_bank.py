@@ -32,7 +32,7 @@ STATES = (
     {"pupil_diameter_mm": 4.0, "focus_dpt": 0.5},
 )
 
-pytestmark = pytest.mark.long("a bank of two eyes is built in a process")
+long = pytest.mark.long("builds eyes in a process")
 
 
 @pytest.fixture(scope="module")
@@ -73,6 +73,7 @@ def expected(frame):
     return images(PEOPLE, frame)
 
 
+@long
 @pytest.mark.parametrize("worker", [False, True])
 def test_images_have_the_same_bytes_as_without_a_bank(bank, frame, expected, worker):
     np.testing.assert_array_equal(images(bank, frame, worker=worker), expected)
@@ -100,6 +101,7 @@ def test_a_bank_is_a_sequence_of_private_files(bank):
     assert size_mb / 2 < 5.0
 
 
+@long
 def test_an_interrupted_build_continues(bank, copied):
     kept, missing = (copied / f"eye_00000{k}.psfs" for k in range(2))
     before, changed_ns = missing.read_bytes(), kept.stat().st_mtime_ns
@@ -173,6 +175,7 @@ def test_frames_must_suit_the_bank(bank, frame):
         eye_filter.wait()
 
 
+@long
 def test_an_eye_that_cannot_be_built_is_named(tmp_path):
     lens = {"kind": "iol", "design": "bifocal", "add_dpt": 3.0}
     person = {"kind": "prescription", "sphere_dpt": 0.0, "correction": lens}
@@ -188,6 +191,7 @@ def test_an_eye_that_cannot_be_built_is_named(tmp_path):
         EyeBank.build(tmp_path / "none", [], CAMERA)
 
 
+@long
 def test_the_command_builds_a_bank_of_drawn_persons(tmp_path):
     folder = tmp_path / "people"
     settings = SETTINGS.changed(mode="on-axis")
@@ -209,6 +213,7 @@ def _seen(folder, frame, results):
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+@long
 def test_processes_share_the_memory_of_files(bank, frame, expected):
     spawn = multiprocessing.get_context("spawn")
     results = spawn.SimpleQueue()
