@@ -1,7 +1,7 @@
 """Record of a batch: a line per frame during the run, and a summary at the end.
 
-    manifest.jsonl   the job and facts about its start, then a line for each frame and each video; if one was
-                     made again, its last line counts
+    manifest.jsonl   the job and facts about its start, then a line for each frame and
+                     each video; if one was made again, its last line counts
     manifest.json    the job, counts, failures and notes
 
 One process appends complete lines; a partial line after a power failure is removed. A

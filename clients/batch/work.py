@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -51,6 +52,8 @@ Format = Literal["png", "npy", "exr", "ffv1", "h264"]
 ATTEMPTS = 2
 PNG_LEVEL = 1
 """Files are a fifth larger than by default and take a quarter of the time."""
+
+ARCMIN_PER_MRAD = 60.0 * math.degrees(1e-3)
 
 FAILURES = (ValueError, FilterError, OSError, MemoryError)
 """Exceptions that make a frame fail, but not the batch."""
@@ -356,7 +359,10 @@ class UnitRunner:
             "pupil_mm": seen.pupil_diameter_mm,
             "focus_dpt": seen.focus_dpt,
             **{name: seen.counts[name] for name in COUNTS},
-            "notes": [*color.notes, *depth.notes, *seen.notes],
+            "notes": [
+                *(*color.notes, *depth.notes, *seen.notes),
+                *_margin_notes(frame, seen.pupil_diameter_mm, seen.focus_dpt),
+            ],
             "inputs": inputs,
             "source": frame.described(),
             "ms": {"read": read_ms, "filter": _ms_since(start_s)},
@@ -460,6 +466,27 @@ def _failed(profile: str, frame: SourceFrame, error: BaseException) -> Record:
         "error": text,
         "files": [path.name for path in (frame.color, frame.depth) if path],
     }
+
+
+def _margin_notes(
+    frame: SourceFrame, pupil_mm: float, focus_dpt: float
+) -> tuple[str, ...]:
+    """Note if blur reaches from beyond the picture into what it shows.
+
+    The radius is that of the geometric blur of defocus, without other aberrations.
+    """
+    margin_arcmin = frame.facts.get("margin_arcmin")
+    if margin_arcmin is None or not isinstance(frame.depth_form, Constant):
+        return ()
+    defocus_dpt = abs(focus_dpt - frame.depth_form.distance_dpt)
+    radius_arcmin = 0.5 * pupil_mm * defocus_dpt * ARCMIN_PER_MRAD
+    if radius_arcmin <= margin_arcmin:
+        return ()
+    return (
+        f"blur of radius {radius_arcmin:.3g} arcmin exceeds the margin of "
+        f"{margin_arcmin:.3g} arcmin around the stimulus: light from outside the "
+        "picture is missing; use a larger picture",
+    )
 
 
 def _ms_since(start_s: float) -> float:

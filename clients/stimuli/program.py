@@ -110,6 +110,7 @@ class StimulusSet:
                         facts={
                             "stimulus": {"name": one.name, **one.parameters},
                             "pixel_arcmin": one.display.pixel_arcmin,
+                            "margin_arcmin": one.margin_arcmin,
                         },
                     )
                     for name, one in some.items()

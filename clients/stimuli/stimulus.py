@@ -55,6 +55,19 @@ class Stimulus:
         """8-bit sRGB (height, width, 3)."""
         return srgb8_of(self.linear_rgb)
 
+    @property
+    def margin_arcmin(self) -> float | None:
+        """Width of the background around the stimulus; None if it fills the picture."""
+        light = self.light
+        differs = light != light[0, 0]
+        if not differs.any() or differs[[0, -1]].any() or differs[:, [0, -1]].any():
+            return None
+        margins_px = []
+        for along, side_px in enumerate(light.shape):
+            found = np.flatnonzero(differs.any(axis=1 - along))
+            margins_px += [int(found[0]), side_px - 1 - int(found[-1])]
+        return min(margins_px) * self.display.pixel_arcmin
+
     def view(self, distance_m: float) -> RgbdView:
         """Return what an eye sees at a distance: the linear light, and its depth."""
         depth_m = np.full(self.light.shape, distance_m, np.float32)

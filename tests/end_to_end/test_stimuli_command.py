@@ -3,6 +3,7 @@
 import hashlib
 import json
 import math
+import re
 from datetime import datetime
 
 import numpy as np
@@ -105,6 +106,7 @@ def test_people_pupils_and_foci_see_what_the_filter_shows(tmp_path):
     shown = {
         "stimulus": {"name": letter.name, **letter.parameters},
         "pixel_arcmin": 0.5,
+        "margin_arcmin": 6.0,  # 40 px of 0.5 arcmin, less 8 arcmin, on both sides
     }
     with Image.open(out / "p_1/pupil5mm/sloan_C_8arcmin.png") as image:
         metadata = json.loads(image.text[METADATA_KEY])
@@ -155,6 +157,23 @@ def test_a_screen_has_other_pixels_at_each_distance(tmp_path):
     }
     assert focused[f"distance0.5m/{name}"] == pytest.approx((3.0, 2.0))
     assert focused[f"distance1m/{name}"] == pytest.approx((3.0, 1.0))
+
+
+@pytest.mark.clients
+@pytest.mark.long("an eye is prepared by a worker")
+def test_blur_beyond_the_margin_is_noted(tmp_path):
+    myopic = '{"kind": "prescription", "sphere_dpt": -6, "higher_order": "none"}'
+    told = run(
+        *("--letters", "C", "--height-arcmin", "8", *SMALL, "--distance-m", "4"),
+        *("-p", f"p={myopic}", "--pupil-mm", "0.5,5", *QUICK, "-o", tmp_path / "out"),
+    )
+    (note,) = [line for line in told.splitlines() if "exceeds the margin" in line]
+    radius, margin = map(float, re.findall(r"of (?:radius )?([\d.]+) arcmin", note))
+    # The entrance pupil is about 3 mm behind the cornea.
+    defocus_dpt = 6.0 / (1.0 + 0.003 * 6.0) - 0.25
+    expected_arcmin = 60.0 * math.degrees(2.5 * defocus_dpt / 1000.0)
+    assert radius == pytest.approx(expected_arcmin, rel=0.01)
+    assert margin == 6.0
 
 
 def test_steps_of_8_bits_are_noted_and_absent_from_exr(tmp_path):
