@@ -254,6 +254,11 @@ class FilterSettings(Record):
                         allowed=f"{modeled!r}, or pipeline 'exact'",
                     )
 
+    @property
+    def display_nm(self) -> tuple[float, float, float]:
+        """Wavelengths of red, green and blue of the display."""
+        return display_wavelengths_nm(self.display)
+
     def frame_options(self, options: RenderOptions) -> RenderOptions:
         """Return a frame's options; the published pipeline has its own accumulation."""
         if self.pipeline == "exact":

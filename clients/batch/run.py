@@ -45,7 +45,6 @@ from clients.batch.source import SourceFrame
 from clients.batch.work import Job, Unit, UnitRunner
 from clients.frame_log import Notes, add_notes, note_line
 from estimator import InvalidFile, thread_count
-from filter_service.displays import display_wavelengths_nm
 
 UNIT_FRAMES = 16
 """Frames per unit of work: few enough that all workers finish at about the same time,
@@ -108,7 +107,7 @@ class Batch:
         return {
             "created": now,
             "argv": ["ocufilter", *map(text_of, sys.argv[1:])],
-            "display_nm": display_wavelengths_nm(self.job.settings.display),
+            "display_nm": self.job.settings.display_nm,
         }
 
     @cached_property

@@ -28,7 +28,6 @@ from filter_service import (
 )
 from filter_service.bounded_images import MAX_FILE_BYTES
 from filter_service.camera import PixelGrid
-from filter_service.displays import display_wavelengths_nm
 from filter_service.errors import WorkerCrashed
 from filter_service.image_files import (
     ImageFile,
@@ -259,7 +258,7 @@ class UnitRunner:
             "distance_m": 1.0 / distance_dpt if distance_dpt else None,
             "distance_dpt": distance_dpt,
             "sample": job.profiles[profile].get("sample"),
-            "display_nm": display_wavelengths_nm(job.settings.display),
+            "display_nm": job.settings.display_nm,
             "render_tolerance": job.render_tolerance,
         }
 
