@@ -14,10 +14,11 @@ import typer
 
 from clients.commands.options import with_options
 from clients.commands.state_options import (
-    EyeName,
+    EyeNames,
     StateOptions,
     ViewOptions,
     listed_numbers,
+    named_eyes,
 )
 from filter_service.command_line import Json, check_range, print_json, print_line
 
@@ -110,7 +111,7 @@ class RefractionOptions(ViewOptions):
 
 @with_options
 def mtf(
-    eye: EyeName,
+    eyes: EyeNames,
     options: MtfOptions,
     as_csv: Csv = False,
     plot: Plot = None,
@@ -139,20 +140,13 @@ def mtf(
         "straylight": options.straylight,
     }
     _check(plot)
-    from estimator import Eye
-
-    report(
-        eye,
-        Eye(eye).mtf(**arguments),
-        as_csv=as_csv,
-        plot=plot,
-        json_output=json_output,
-    )
+    title, found = _of_eyes(eyes, "mtf", arguments)
+    report(title, found, as_csv=as_csv, plot=plot, json_output=json_output)
 
 
 @with_options
 def acuity(
-    eye: EyeName,
+    eyes: EyeNames,
     options: StateOptions,
     as_csv: Csv = False,
     plot: Plot = None,
@@ -170,15 +164,13 @@ def acuity(
     """
     states = options.states()
     _check(plot)
-    from estimator import Eye
-
-    found = Eye(eye).acuity(**states)
-    report(eye, found, as_csv=as_csv, plot=plot, json_output=json_output)
+    title, found = _of_eyes(eyes, "acuity", states)
+    report(title, found, as_csv=as_csv, plot=plot, json_output=json_output)
 
 
 @with_options
 def refraction(
-    eye: EyeName,
+    eyes: EyeNames,
     options: RefractionOptions,
     as_csv: Csv = False,
     json_output: Json = False,
@@ -199,15 +191,13 @@ def refraction(
         "vertex_mm": options.vertex_mm,
     }
     check_range("--vertex-mm", options.vertex_mm, VERTEX_LIMITS_MM)
-    from estimator import Eye
-
-    found = Eye(eye).refraction(**arguments)
-    report(eye, found, as_csv=as_csv, json_output=json_output)
+    title, found = _of_eyes(eyes, "refraction", arguments)
+    report(title, found, as_csv=as_csv, json_output=json_output)
 
 
 @with_options
 def through_focus(
-    eye: EyeName,
+    eyes: EyeNames,
     options: ThroughFocusOptions,
     as_csv: Csv = False,
     plot: Plot = None,
@@ -231,10 +221,24 @@ def through_focus(
         )[0],
     }
     _check(plot)
-    from estimator import Eye
+    title, found = _of_eyes(eyes, "through_focus", arguments)
+    report(title, found, as_csv=as_csv, plot=plot, json_output=json_output)
 
-    found = Eye(eye).through_focus(**arguments)
-    report(eye, found, as_csv=as_csv, plot=plot, json_output=json_output)
+
+def _of_eyes(
+    texts: list[str], method: str, arguments: dict[str, Any]
+) -> tuple[str, LabeledArray]:
+    """Return a title, and the result of a method of one or several eyes."""
+    from estimator import Eye
+    from estimator.image_quality.labeled_array import stacked
+
+    eyes = named_eyes(texts)
+    found = {
+        name: getattr(Eye(source), method)(**arguments) for name, source in eyes.items()
+    }
+    if len(found) == 1:
+        return next(iter(found.items()))
+    return ", ".join(found), stacked("eye", found)
 
 
 def print_psfs(
@@ -373,10 +377,13 @@ def _print_table(eye: str, found: LabeledArray) -> None:
         for k, name in enumerate(found.columns())
         if name not in found.coords or found.coords[name].ndim
     ]
-    names = [found.columns()[k] for k in shown]
-    print_line("  ".join(names))
-    for row in found.rows():
-        cells = [
-            f"{row[k]:>{len(name)}.4g}" for k, name in zip(shown, names, strict=True)
-        ]
-        print_line("  ".join(cells))
+    rows = [[found.columns()[k] for k in shown]]
+    rows += [[_cell(row[k]) for k in shown] for row in found.rows()]
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    for row in rows:
+        cells = zip(row, widths, strict=True)
+        print_line("  ".join(f"{cell:>{width}}" for cell, width in cells))
+
+
+def _cell(value: Any) -> str:
+    return value if isinstance(value, str) else f"{value:.4g}"

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+import os
+import re
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Annotated, Any
 
@@ -20,12 +22,24 @@ EyeName = Annotated[
     ),
 ]
 
+EyeNames = Annotated[
+    list[str],
+    typer.Argument(
+        metavar="EYE...",
+        help="One or more eyes: name of a preset or schematic eye, a .json, .abp, .csv "
+        "or .zmx profile, or JSON text.  NAME=EYE sets the name in the output.",
+    ),
+]
+
 MAX_NUMBERS = 10_000
 
 PUPIL_LIMITS_MM = (0.5, 12.0)
 WAVELENGTH_LIMITS_NM = (380.0, 780.0)
 FIELD_LIMITS_DEG = (-75.0, 75.0)
 DISTANCE_LIMITS_DPT = (-20.0, 20.0)
+
+_NAMED = re.compile(r"([^={]+)=(.+)", re.DOTALL)
+"""NAME=EYE; an equals sign within JSON text is not one."""
 
 FORM = "numbers separated by commas, or first:last:step"
 
@@ -85,6 +99,27 @@ LIMITS = {
     "focus_dpt": DISTANCE_LIMITS_DPT,
     "object_dpt": DISTANCE_LIMITS_DPT,
 }
+
+
+def named_eyes(texts: Sequence[str]) -> dict[str, str]:
+    """Return eyes by their names: EYE itself, or NAME of NAME=EYE.
+
+    Raises
+    ------
+    ValueError
+        Two eyes have the same name.
+    """
+    found: dict[str, str] = {}
+    for text in texts:
+        given = None if os.path.isfile(text) else _NAMED.fullmatch(text)
+        name, eye = (given[1], given[2]) if given else (text, text)
+        if name in found:
+            raise ValueError(
+                f"EYE: two eyes have the name {name!r:.60}; allowed: NAME=EYE with "
+                "another name"
+            )
+        found[name] = eye
+    return found
 
 
 def states_of(

@@ -257,6 +257,57 @@ class LabeledArray:
         return figure_of(self, quantity_axis=QUANTITY, x=x)
 
 
+def stacked(dim: str, arrays: Mapping[str, LabeledArray]) -> LabeledArray:
+    """Return arrays of the same axes as one, along a new first axis.
+
+    Coordinates that differ, or that not every array has, get the new axis; missing
+    numbers are NaN.  Notes begin with the name of their array.
+
+    Parameters
+    ----------
+    dim : str
+        Name of the new axis.
+    arrays : mapping
+        Arrays by their coordinate along it.
+
+    Raises
+    ------
+    ValueError
+        The axes of the arrays differ.
+    """
+    first, *others = arrays.values()
+    for other in others:
+        if (other.name, other.sizes) != (first.name, first.sizes):
+            raise ValueError(
+                f"{other.name} {other.sizes}: expected {first.name} {first.sizes}"
+            )
+    coords: dict[str, NDArray[Any]] = {dim: np.array([*arrays])}
+    coord_dims: dict[str, tuple[str, ...]] = {}
+    # Of the array with the most coordinates, for their order.
+    for known in sorted(arrays.values(), key=lambda array: -len(array.coords)):
+        for name, values in known.coords.items():
+            if name in coords:
+                continue
+            absent = np.full(values.shape, np.nan if values.dtype.kind == "f" else "")
+            each = [array.coords.get(name, absent) for array in arrays.values()]
+            coords[name], coord_dims[name] = values, known.dims_of(name)
+            if not all(np.array_equal(other, values) for other in each):
+                coords[name], coord_dims[name] = (
+                    np.stack(each),
+                    (dim, *coord_dims[name]),
+                )
+    return labeled(
+        np.stack([array.values for array in arrays.values()]),
+        (dim, *first.dims),
+        coords,
+        name=first.name,
+        coord_dims=coord_dims,
+        notes=tuple(
+            f"{k}: {note}" for k, array in arrays.items() for note in array.notes
+        ),
+    )
+
+
 def labeled(
     values: ArrayLike,
     dims: tuple[str, ...],

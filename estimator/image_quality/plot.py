@@ -51,7 +51,7 @@ def figure_of(array: Any, *, quantity_axis: str, x: str | None = None) -> Figure
         return _images(array)
     long = [d for d in array.dims if array.sizes[d] > 1 and d != quantity_axis]
     if x is None and long:
-        x = max(long[::-1], key=array.sizes.__getitem__)
+        x = max(long[::-1], key=lambda d: (_is_numeric(array, d), array.sizes[d]))
     if x is None or x not in long:
         raise ValueError(
             f"x {x!r}: expected an axis of more than one number: "
@@ -111,6 +111,10 @@ def _images(array: Any) -> Figure:
     return figure
 
 
+def _is_numeric(array: Any, dim: str) -> bool:
+    return dim not in array.coords or array.coords[dim].dtype.kind in "fiu"
+
+
 def _label(array: Any, index: dict[str, int]) -> str:
     """Return the coordinates of a line or an image."""
     texts = []
@@ -120,6 +124,11 @@ def _label(array: Any, index: dict[str, int]) -> str:
             texts.append(f"{dim} {position}")
         for name in names:
             value = array.coords[name][position].item()
+            if isinstance(value, str):
+                texts.append(value)
+                continue
+            if np.isnan(value):  # an eye without this coordinate
+                continue
             text = f"{value:g}" if isinstance(value, float) else str(value)
             quantity, _, unit = name.rpartition("_")
             texts.append(f"{quantity.replace('_', ' ')} {text} {unit}".strip())

@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from clients.commands.image_quality import _within_light
-from clients.commands.state_options import listed_numbers
+from clients.commands.state_options import listed_numbers, named_eyes
 from estimator import Eye
 from estimator.psf.compute import disc_mask
 from tests.commands import run_command
@@ -88,6 +88,41 @@ def test_acuity_and_through_focus_have_a_column_for_each_quantity():
     rows = rows_of(printed(*words))
     assert [float(row["defocus_dpt"]) for row in rows] == [-1.0, 0.0, 1.0]
     assert list(rows[0])[-3:] == ["log_mar", "visual_strehl_ratio", "modulation_ratio"]
+
+
+@pytest.mark.long("transfer functions of two eyes, twice, and a figure")
+def test_several_eyes_are_one_table_and_one_figure(tmp_path):
+    body = json.dumps({"kind": "prescription", "sphere_dpt": -1})
+    words = ("--pupil-mm", "2", "--frequency-cpd", "10,20")
+    eyes = ("arizona", f"mine={body}")
+    out = tmp_path / "mtf.png"
+    rows = rows_of(printed("mtf", *eyes, *words, "--csv", "--plot", out))
+    assert [row["eye"] for row in rows] == ["arizona", "arizona", "mine", "mine"]
+    alone = [
+        row for eye in eyes for row in rows_of(printed("mtf", eye, *words, "--csv"))
+    ]
+    values = [row["modulation_ratio"] for row in rows]
+    assert values == [row["modulation_ratio"] for row in alone]
+    # An eye given by its surfaces is relaxed: it has no focus.
+    assert [row["focus_dpt"] for row in rows] == ["nan", "nan", "0.0", "0.0"]
+    assert np.asarray(Image.open(out)).std() > 10.0
+    text = printed("refraction", *eyes, "--pupil-mm", "2")
+    assert "arizona, mine: h_deg 0, v_deg 0, pupil_diameter_mm 2" in text
+    assert "note: mine: prescription: -1.00 at the cornea" in text
+
+
+def test_names_of_eyes_are_not_parts_of_json_or_of_files(tmp_path):
+    file = tmp_path / "a=b.json"
+    file.touch()
+    text = '{"kind": "prescription", "name": "a=b"}'
+    assert named_eyes([text, str(file), f"me={text}", "myopia"]) == {
+        text: text,
+        str(file): str(file),
+        "me": text,
+        "myopia": "myopia",
+    }
+    with pytest.raises(ValueError, match="two eyes have the name 'me'"):
+        named_eyes(["me=myopia", "me=emmetropia"])
 
 
 def test_refraction_is_the_prescription_with_wavelength_and_pupil():
