@@ -51,7 +51,7 @@ COMMANDS = {
     ),
     "best-lens": (
         "clients.commands.best_lens:find_best_lens",
-        "Find the spectacles or contact lens that are best for a scene.",
+        "Find the spectacles or contact lens best for a scene.",
     ),
     "batch": (
         "clients.batch.program:batch",
@@ -63,7 +63,7 @@ COMMANDS = {
     ),
     "stimuli": (
         "clients.stimuli.program:stimuli",
-        "Draw stimuli of exact angular size, and filter them through eyes.",
+        "Draw stimuli of exact size; filter them through eyes.",
     ),
     "estimate": (
         "clients.commands.eye:estimate",

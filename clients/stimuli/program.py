@@ -275,7 +275,7 @@ def lines_of(summary: dict[str, Any], options: StimuliOptions) -> list[str]:
 
 @with_options
 def stimuli(options: StimuliOptions, json_output: Json = False) -> None:
-    """Draw stimuli of exact angular size, and filter them through eyes.
+    """Draw stimuli of exact size; filter them through eyes.
 
     Letters as pictures:
 

@@ -18,6 +18,7 @@ MAY_READ_IT = {
     # file: why
     "filter_service/psfs/store_cache.py": "compares with the times of files",
     "clients/report/make.py": "dates a report",
+    "clients/batch/run.py": "dates a manifest",
 }
 
 
