@@ -34,11 +34,13 @@ def frozen(name):
 
 
 def assert_holds(now, then, path=""):
-    """Everything that there was is there, with the same values."""
+    """Everything that there was is there, with the same values; notes may be added."""
     if isinstance(then, dict):
         for name, value in then.items():
             assert name in now, f"{path}.{name} is gone"
             assert_holds(now[name], value, f"{path}.{name}")
+    elif isinstance(then, list) and path.endswith(".notes"):
+        assert [note for note in then if note not in now] == [], path
     elif isinstance(then, list):
         assert len(now) == len(then), path
         for number, (item, old) in enumerate(zip(now, then, strict=True)):

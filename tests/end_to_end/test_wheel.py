@@ -36,6 +36,7 @@ HELD = (
     "estimator/networks/weights/*.onnx",
     "estimator/networks/weights/*.json",
     "estimator/profiles/presets.json",
+    "estimator/color/cie_2006.csv",
     "estimator/estimate/eye_table.json",
     "estimator/profiles/published/*.json",
     "estimator/periphery/population.json",

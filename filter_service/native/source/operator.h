@@ -61,9 +61,9 @@ INLINE void add_vectors(const uint32_t *words, ptrdiff_t stride, const members *
     int last_row = smaller_int(last[-1].top + height, BIN_HEIGHT);
     words += row * stride + 8 * first;
     float *to = own->rows + row * ROW_FLOATS + 8 * first;
-    i32x8 lanes[RGB];         /* colors of adjacent vectors */
+    i32x8 places = {0, 1, 2, 3, 4, 5, 6, 7}, lanes[RGB];  /* colors of adjacent vectors */
     for (int v = 0; v < RGB; ++v)
-        for (int i = 0; i < 8; ++i) lanes[v][i] = (8 * (first + v) + i) % RGB;
+        lanes[v] = (places + all_ints8(8 * (first + v))) % all_ints8(RGB);
     for (; row < last_row; ++row, words += stride, to += ROW_FLOATS) {
         while (end < last && end->top <= row) ++end;
         while (one < end && one->top + height <= row) ++one;
