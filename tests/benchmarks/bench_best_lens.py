@@ -35,7 +35,7 @@ from filter_service.correcting.lens_search import (
 )
 from filter_service.filtering.eye_filter import EyeFilter
 from filter_service.filtering.shared_builder import open_inline_builder
-from filter_service.filtering.stream_eyes import as_profile
+from filter_service.given_profile import as_profile
 from filter_service.rgbd_view import RgbdView
 from tests.benchmarks.bench_correct import (
     PICTURES,
