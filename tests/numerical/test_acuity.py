@@ -462,7 +462,7 @@ def test_over_the_field_the_retina_limits_sharp_eyes():
 
 
 @pytest.mark.parametrize("j", [7, 8])
-def test_letters_are_seen_through_the_psf_that_is_not_turned(j):
+def test_letters_are_seen_through_the_psf_in_its_own_orientation(j):
     zernike_um = np.zeros(28)
     zernike_um[[3, j]] = 0.05, 0.25
     pupil = {"zernike_radius_mm": 2.0, "wavelength_nm": 555.0}
