@@ -260,7 +260,7 @@ def test_of_three_frames_at_once_the_third_exceeds_a_credit_of_two(
     shared_service, raw_client
 ):
     raw = raw_client(shared_service)
-    raw.begin(more={"filter_ms": 100})
+    raw.begin(more={"filter_ms": 400})
     for frame_id in (1, 2, 3):
         raw.send(encode(small_frame(frame_id)))
     replies = {reply.frame_id: reply for reply in (raw.receive() for _ in range(3))}
