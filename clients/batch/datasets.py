@@ -204,18 +204,27 @@ def color_frames(
 ) -> list[SourceFrame]:
     """Return the color images in a folder, whose depth is constant.
 
+    If it contains none, they are those of its subfolders at any level, and their names
+    are paths relative to it.
+
     Raises
     ------
     ValueError
         If two files have the same name.
     """
     folder = _sub_folder(source, COLOR_FOLDERS) or source
-    files = images_in(folder, COLOR_SUFFIXES)
-    colors = [path for path in files if not _DEPTH_WORD.search(path.stem)]
-    return [
-        SourceFrame(name, path, None, optics, depth_form)
-        for name, path in _named(colors, _COLOR_WORD).items()
-    ]
+    folders = [folder]
+    if not images_in(folder, COLOR_SUFFIXES):
+        inner = [path for path in folder.rglob("*") if path.is_dir()]
+        folders = sorted(path for path in inner if not path.name.startswith("."))
+    found = []
+    for place in folders:
+        files = images_in(place, COLOR_SUFFIXES)
+        colors = [path for path in files if not _DEPTH_WORD.search(path.stem)]
+        for name, path in _named(colors, _COLOR_WORD).items():
+            inside = same_text((place.relative_to(folder) / name).as_posix())
+            found.append(SourceFrame(inside, path, None, optics, depth_form))
+    return found
 
 
 def _colors_and_depths(

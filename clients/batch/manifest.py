@@ -32,6 +32,9 @@ from estimator.bounded_files import loads_bounded
 from filter_service.atomic_files import PART_NAME, replace_atomically, write_atomically
 
 LINES, SUMMARY = "manifest.jsonl", "manifest.json"
+LABELS = "labels.csv"
+"""Labels of frames that have eyes of their own."""
+
 RESTART = "the same value, another folder, or --overwrite"
 MAX_LINE_BYTES, MAX_LINE_ITEMS = 16_000_000, 2_000_000
 """Limits of a line; a job with states of 200,000 frames, the maximum, takes half."""

@@ -9,6 +9,18 @@ from typing import Annotated, Any, Literal
 
 import typer
 
+from clients.batch.eyes import (
+    COLUMNS,
+    LIMITS,
+    MAX_DRAWN,
+    SYNTEYES,
+    Drawn,
+    EyeRow,
+    is_table_of_eyes,
+    read_eyes,
+    settings_of_rows,
+    with_rows,
+)
 from clients.batch.layouts import list_frames, optics_of
 from clients.batch.run import Batch
 from clients.batch.source import Constant, SourceFrame, States, read_states
@@ -22,6 +34,7 @@ from clients.batch.work import (
     batch_settings,
 )
 from clients.commands.options import read_object
+from clients.commands.state_options import listed_numbers
 from clients.provenance import folder_name, profile_name
 from estimator import (
     PEOPLE_LIMITS,
@@ -32,6 +45,7 @@ from estimator import (
     profile_body,
     thread_count,
 )
+from filter_service import FilterSettings
 from filter_service.command_line import check_range
 from filter_service.settings import MAX_RENDER_TOLERANCE
 
@@ -116,15 +130,59 @@ class BatchOptions(ImageSetOptions):
         typer.Argument(metavar="INPUT", help="Folder or video."),
     ]
     profile: Annotated[
-        list[str],
+        list[str] | None,
         typer.Option(
             "--profile",
             "-p",
             metavar="P",
             help="Preset name, a .json, .abp, .csv or .zmx file, or JSON; repeatable.  "
-            "NAME=P sets the name of its folder.",
+            "NAME=P sets the name of its folder.  Required without --eyes, "
+            "--sample-eyes and --bank.",
         ),
-    ]
+    ] = None
+    eyes: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="CSV",
+            help="Table with one row per image or glob, and the columns image, "
+            f"{', '.join(COLUMNS[1:])}; columns and cells may be missing.",
+        ),
+    ] = None
+    sample_eyes: Annotated[
+        int | None,
+        typer.Option(
+            metavar="N",
+            help="Filter each image through one of N persons, drawn for each profile "
+            "as by --people; without --profile, from SyntEyes.",
+        ),
+    ] = None
+    bank: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="DIR",
+            help="Filter each image through one of the eyes of a bank, see "
+            "`ocufilter bank`.",
+        ),
+    ] = None
+    seed: Annotated[
+        int, typer.Option(metavar="S", help="Seed of --sample-eyes and --bank.")
+    ] = 0
+    sample_pupil_mm: Annotated[
+        str | None,
+        typer.Option(
+            metavar="LOW,HIGH",
+            help="Range from which the pupil of each image is drawn, mm, instead of "
+            "--pupil-mm.",
+        ),
+    ] = None
+    sample_focus_dpt: Annotated[
+        str | None,
+        typer.Option(
+            metavar="LOW,HIGH",
+            help="Range from which the focus of each image is drawn, dpt, instead of "
+            "--focus-dpt.",
+        ),
+    ] = None
     layout: Annotated[
         Layout,
         typer.Option(help="Layout of a folder; auto detects it from the content."),
@@ -168,7 +226,7 @@ class BatchOptions(ImageSetOptions):
         typer.Option(
             metavar="CSV",
             help="Table with one row per frame and the columns frame, pupil_mm and "
-            "focus_dpt.",
+            "focus_dpt; with profile, each frame has an eye of its own, as by --eyes.",
         ),
     ] = None
     format: Annotated[
@@ -216,38 +274,175 @@ def batch_of(options: BatchOptions) -> Batch:
         fps=FPS_LIMITS_HZ,
         price_per_core_hour=(0.0, float("inf")),
         depth_scale=(1e-9, 1e9),
+        sample_eyes=(1, MAX_DRAWN),
     )
     _check_format(options)
+    way = _way_of_eyes(options)
     views = Views.of(options.distance_m, options.pupil_mm, options.focus_dpt)
+    rows = _rows_of(options)
+    constant = Constant(views.distances_dpt[0]) if views.distances_dpt else None
+    if constant is None and rows and all("distance_m" in row.values for row in rows):
+        constant = Constant(0.0)  # which each row replaces
     layout, frames = list_frames(
         options.source,
         options.layout,
         options.depth,
         optics_of(options.fov_deg, options.intrinsics),
         options.depth_scale,
-        Constant(views.distances_dpt[0]) if views.distances_dpt else None,
+        constant,
     )
+    if views.count > 1:
+        _check_several(options, way)
+    common: dict[str, Any] = {
+        "format": options.format,
+        "half": options.half,
+        "engine": options.engine,
+        "render_tolerance": options.render_tolerance,
+    }
+    if way is not None:
+        _check_own_eyes(options, way)
+        frames, settings, details = _with_own_eyes(options, views, rows, frames)
+        states = States(views.pupils_mm[0], views.foci_dpt[0])
+        job = Job(profiles={}, settings=settings, states=states, **common)
+        frames = frames[: options.limit]
+        return Batch(job, layout, options.source, frames, options.out, details)
     frames = frames[: options.limit]
     if options.fps is not None:
         frames = [replace(frame, time_s=None) for frame in frames]
-    if views.count > 1:
-        _check_several(options)
     frames, states = views.of_frames(frames)
     if options.states is not None:
         states = _listed(options.states, states, [frame.name for frame in frames])
-    profiles = profiles_of(options, options.profile)
-    settings = read_object("--settings", options.settings)
+    profiles = profiles_of(options, options.profile or ())
+    given = read_object("--settings", options.settings)
     job = Job(
         profiles=profiles,
-        settings=batch_settings(settings, states, views.distances_dpt),
+        settings=batch_settings(given, states, views.distances_dpt),
         states=states,
-        format=options.format,
-        half=options.half,
-        engine=options.engine,
-        render_tolerance=options.render_tolerance,
         rate_hz=_rate_hz(options, frames),
+        **common,
     )
     return Batch(job, layout, options.source, frames, options.out)
+
+
+def _way_of_eyes(options: BatchOptions) -> str | None:
+    """Return the option that gives each image its own eye, or None.
+
+    Raises
+    ------
+    ValueError
+        If options exclude each other, or none gives an eye.
+    """
+    ways = [
+        f"--{name.replace('_', '-')}"
+        for name in ("eyes", "sample_eyes", "bank")
+        if getattr(options, name) is not None
+    ]
+    if options.states is not None:
+        if not options.states.is_file():
+            raise ValueError(f"--states '{options.states}': no such file")
+        ways += ["--states"] if is_table_of_eyes(options.states) else []
+    if len(ways) > 1:
+        raise ValueError(f"{' and '.join(ways)} are given; allowed: one of them")
+    if not ways and not options.profile:
+        raise ValueError(
+            "--profile is not given; allowed: --profile, --eyes, --sample-eyes or "
+            "--bank"
+        )
+    way = ways[0] if ways else None
+    is_drawn = way in ("--sample-eyes", "--bank")
+    for name in ("sample_pupil_mm", "sample_focus_dpt"):
+        if getattr(options, name) is not None and not is_drawn:
+            raise ValueError(
+                f"--{name.replace('_', '-')} is given; allowed with --sample-eyes or "
+                "--bank"
+            )
+    return way
+
+
+def _check_own_eyes(options: BatchOptions, way: str) -> None:
+    """Check that other options fit frames that have eyes of their own."""
+    excluded = {
+        "people": options.people is not None,
+        "states": options.states is not None and way != "--states",
+        "profile": bool(options.profile) and way == "--bank",
+        "settings": options.settings != "{}" and way == "--bank",
+    }
+    for name, is_given in excluded.items():
+        if is_given:
+            raise ValueError(f"{way} and --{name} are given; allowed: one of them")
+    if options.format in VIDEO_FORMATS:
+        allowed = ", ".join(name for name in FORMATS if name not in VIDEO_FORMATS)
+        raise ValueError(
+            f"--format is {options.format}, with {way}; allowed: {allowed}"
+        )
+
+
+def _rows_of(options: BatchOptions) -> list[EyeRow]:
+    """Return the rows of a table of eyes, if there is one."""
+    path, name = options.eyes, "eyes"
+    if path is None and options.states is not None and is_table_of_eyes(options.states):
+        path, name = options.states, "states"
+    if path is None:
+        return []
+    if not path.is_file():
+        raise ValueError(f"--{name} '{path}': no such file")
+    return read_eyes(path, option=name, named=read_profiles(options.profile or ()))
+
+
+def _with_own_eyes(
+    options: BatchOptions,
+    views: Views,
+    rows: Sequence[EyeRow],
+    frames: Sequence[SourceFrame],
+) -> tuple[list[SourceFrame], FilterSettings, dict[str, Any]]:
+    """Return frames with their eyes, settings, and what determines the eyes."""
+    given = read_object("--settings", options.settings)
+    usual = States(views.pupils_mm[0], views.foci_dpt[0])
+    distance_dpt = views.distances_dpt[0] if views.distances_dpt else None
+    if rows:
+        path = options.eyes or options.states
+        assert path is not None
+        settings = settings_of_rows(given, rows, usual, distance_dpt)
+        found = with_rows(
+            frames,
+            rows,
+            usual,
+            gaze_deg=settings.gaze_deg,
+            path=path,
+            source=options.source,
+            option="states" if options.eyes is None else "eyes",
+        )
+        return found, settings, {}
+    if distance_dpt is not None and usual.focus_dpt is None:
+        usual = replace(usual, focus_dpt=distance_dpt)
+    pupils_mm = _drawn_range("--sample-pupil-mm", options.sample_pupil_mm, "pupil_mm")
+    foci_dpt = _drawn_range("--sample-focus-dpt", options.sample_focus_dpt, "focus_dpt")
+    if foci_dpt is None and usual.focus_dpt is not None:
+        foci_dpt = usual.focus_dpt, usual.focus_dpt
+    count = options.sample_eyes or 0
+    _check_last_person("--sample-eyes", count, options.first_person)
+    drawn = Drawn.of(
+        options.bank,
+        read_profiles(options.profile or ()) or SYNTEYES,
+        count,
+        options.first_person,
+        seed=options.seed,
+        pupil_range_mm=pupils_mm or (usual.pupil_mm, usual.pupil_mm),
+        focus_range_dpt=foci_dpt,
+    )
+    settings = drawn.settings(given, distance_dpt)
+    return drawn.of_frames(frames), settings, {"drawn": drawn.described}
+
+
+def _drawn_range(
+    option: str, text: str | None, column: str
+) -> tuple[float, float] | None:
+    if text is None:
+        return None
+    values = listed_numbers(option, text, LIMITS[column])
+    if len(values) != 2 or values[0] > values[1]:
+        raise ValueError(f"{option} is '{text:.60}'; allowed: LOW,HIGH")
+    return values[0], values[1]
 
 
 def workers_and_threads(options: ImageSetOptions) -> tuple[int, int]:
@@ -298,9 +493,11 @@ def _check_format(options: BatchOptions) -> None:
         raise ValueError("--half: allowed with --format npy or exr")
 
 
-def _check_several(options: BatchOptions) -> None:
+def _check_several(options: BatchOptions, way: str | None) -> None:
     """Check that frames may be filtered in several states."""
     several = "several distances, pupils or foci"
+    if way not in (None, "--states"):
+        raise ValueError(f"{way} and {several} are given; allowed: one of them")
     if options.states is not None:
         raise ValueError(f"--states and {several} are given; allowed: one of them")
     if options.format in VIDEO_FORMATS:
@@ -312,8 +509,6 @@ def _check_several(options: BatchOptions) -> None:
 
 def _listed(path: Path, states: States, names: Sequence[str]) -> States:
     """Return states with the values of a table."""
-    if not path.is_file():
-        raise ValueError(f"--states '{path}': no such file")
     states = replace(states, listed=read_states(path, names))
     states.check(names)
     return states
@@ -335,6 +530,14 @@ def profiles_of(
     return drawn_people(profiles, options.people, options.first_person)
 
 
+def _check_last_person(option: str, count: int, first: int) -> None:
+    if first + count - 1 > MAX_SAMPLE:
+        raise ValueError(
+            f"--first-person is {first} with {option} {count}; allowed: up to "
+            f"{MAX_SAMPLE - count + 1}"
+        )
+
+
 def drawn_people(
     profiles: Mapping[str, Mapping[str, Any]], count: int, first: int
 ) -> dict[str, dict[str, Any]]:
@@ -347,12 +550,8 @@ def drawn_people(
     ValueError
         If persons with a profile do not differ.
     """
+    _check_last_person("--people", count, first)
     last = first + count - 1
-    if last > MAX_SAMPLE:
-        raise ValueError(
-            f"--first-person is {first} with --people {count}; allowed: up to "
-            f"{MAX_SAMPLE - count + 1}"
-        )
     digits = len(str(last))
     found: dict[str, dict[str, Any]] = {}
     for name, body in profiles.items():

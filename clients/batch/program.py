@@ -93,10 +93,10 @@ def filter_batch(
         Progress("batch", quiet=quiet) as progress,
     ):
         prepare()
-        names = list(batch.job.profiles)
+        names = list(batch.frames_of)
         task = progress.task(
             names[0] if len(names) == 1 else f"{len(names)} profiles",
-            total=len(batch.frames) * len(batch.job.profiles),
+            total=batch.count,
         )
         return run_batch(
             batch, manifest, pool, on_done=lambda n_done, n_all: task.update(n_done)

@@ -25,7 +25,9 @@ from typing import Any, cast
 
 import numpy as np
 
+from clients.batch.labels import write_labels
 from clients.batch.manifest import (
+    LABELS,
     LINES,
     SUMMARY,
     Manifest,
@@ -42,13 +44,16 @@ from clients.batch.manifest import (
 )
 from clients.batch.pools import ProcessPool, RayPool
 from clients.batch.source import SourceFrame
-from clients.batch.work import Job, Unit, UnitRunner
+from clients.batch.work import EYES_FOLDER, Job, Unit, UnitRunner
 from clients.frame_log import Notes, add_notes, note_line
 from estimator import InvalidFile, thread_count
 
 UNIT_FRAMES = 16
 """Frames per unit of work: few enough that all workers finish at about the same time,
 and enough that distribution takes no time."""
+
+EYE_FRAMES = 64
+"""Frames per unit of frames with eyes of their own: one worker builds an eye."""
 
 SEGMENT_FRAMES = 48
 """Frames per video segment. The number does not depend on the workers, because it
@@ -96,6 +101,32 @@ class Batch:
     frames: Sequence[SourceFrame]
     out: Path
     details: Mapping[str, Any] = field(default_factory=dict)
+
+    @cached_property
+    def frames_of(self) -> dict[str, Sequence[SourceFrame]]:
+        """The frames of each profile: all, or those that have this eye."""
+        if not self.has_own_eyes:
+            return dict.fromkeys(self.job.profiles, self.frames)
+        found: dict[str, list[SourceFrame]] = {}
+        for frame in self.frames:
+            assert frame.eye is not None
+            found.setdefault(frame.eye.name, []).append(frame)
+        return {**found}
+
+    @property
+    def has_own_eyes(self) -> bool:
+        """Whether each frame has an eye of its own instead of all profiles."""
+        return any(frame.eye is not None for frame in self.frames)
+
+    @property
+    def count(self) -> int:
+        """Number of results."""
+        return sum(map(len, self.frames_of.values()))
+
+    @property
+    def folders(self) -> Sequence[str]:
+        """Folders of results in the output folder."""
+        return [EYES_FOLDER] if self.has_own_eyes else list(self.job.profiles)
 
     def described(self) -> dict[str, Any]:
         """Return the parameters that determine the images, for JSON."""
@@ -205,7 +236,8 @@ def begin_anew(batch: Batch) -> None:
             if path is not None and not path.is_dir():
                 path.unlink(missing_ok=True)
     _remove_segments(batch.out)
-    (batch.out / SUMMARY).unlink(missing_ok=True)
+    for name in (SUMMARY, LABELS):
+        (batch.out / name).unlink(missing_ok=True)
     begin_manifest(batch.out, job, batch.facts())
 
 
@@ -229,7 +261,7 @@ def check_links(batch: Batch) -> None:
     ValueError
         If one is.  The message names it.
     """
-    for name in (SEGMENTS, *batch.job.profiles):
+    for name in (SEGMENTS, *batch.folders):
         if below(batch.out, f"{name}/file") is None:
             raise ValueError(
                 f"'{batch.out / name}' leads outside '{batch.out}'; allowed: a folder "
@@ -275,7 +307,8 @@ def missing_units(batch: Batch, manifest: Manifest) -> list[Unit]:
     """
     units: list[Unit] = []
     known = cache(content_of)  # frames share segments, and profiles share inputs
-    for profile in batch.job.profiles:
+    unit_frames = EYE_FRAMES if batch.has_own_eyes else UNIT_FRAMES
+    for profile in batch.frames_of:
         for segment, frames in _parts(batch, profile):
             is_done = _are_done(profile, frames, manifest, known)
             missing = [
@@ -283,7 +316,7 @@ def missing_units(batch: Batch, manifest: Manifest) -> list[Unit]:
             ]
             if missing and segment is not None:
                 missing = list(frames)  # a segment is always written completely
-            step = SEGMENT_FRAMES if segment is not None else UNIT_FRAMES
+            step = SEGMENT_FRAMES if segment is not None else unit_frames
             for start in range(0, len(missing), step):
                 some = tuple(missing[start : start + step])
                 units.append(Unit(len(units), profile, some, segment))
@@ -311,7 +344,7 @@ def _parts(
 ) -> list[tuple[Path | None, Sequence[SourceFrame]]]:
     """Return the frames of a profile, divided into segments for a video."""
     if not batch.job.is_video:
-        return [(None, batch.frames)]
+        return [(None, batch.frames_of[profile])]
     return [
         (
             Path(SEGMENTS) / profile / f"{start:08d}.mkv",
@@ -346,8 +379,8 @@ def run_batch(
     units = missing_units(batch, manifest)
     wanted = {
         (profile, text_of(frame.name))
-        for profile in batch.job.profiles
-        for frame in batch.frames
+        for profile, frames in batch.frames_of.items()
+        for frame in frames
     }
     n_missing = sum(len(unit.frames) for unit in units)
     n_done = len(wanted) - n_missing
@@ -368,6 +401,8 @@ def run_batch(
         remove_parts(batch.out)  # of killed workers
     if batch.job.is_video:
         _join_videos(batch, manifest)
+    if batch.has_own_eyes:
+        write_labels(batch, manifest)
     manifest.check_in_place()
     took_s = time.monotonic() - started_s
     summary = {
@@ -432,7 +467,7 @@ def dry_run(
     batch: Batch, *, n_cores: int, price_per_core_hour: float | None
 ) -> dict[str, Any]:
     """Return the report of `ocufilter batch --dry-run`."""
-    n_all = len(batch.frames) * len(batch.job.profiles)
+    n_all = batch.count
     n_missing = n_all
     if (batch.out / LINES).is_file():
         job = batch.described()

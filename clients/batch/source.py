@@ -19,6 +19,7 @@ from typing import Any, Protocol, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from estimator import EyeProfile
 from estimator.bounded_files import InvalidFile, read_text
 from filter_service.camera import PixelGrid, Tangents
 from filter_service.image_files import (
@@ -164,6 +165,8 @@ class SourceFrame:
     facts : mapping
         What the image shows, as JSON-compatible values, for the record and the metadata
         of its results.
+    eye : FrameEye, optional
+        Eye of this frame alone, if frames do not share the eyes of the batch.
     """
 
     name: str
@@ -176,6 +179,7 @@ class SourceFrame:
     time_s: Fraction | None = None
     fault: str | None = None
     facts: Mapping[str, Any] = field(default_factory=dict, hash=False)
+    eye: FrameEye | None = field(default=None, hash=False)
 
     @property
     def files(self) -> tuple[Path, ...]:
@@ -190,11 +194,12 @@ class SourceFrame:
         return tuple(path for path, index in parts if path and index is not None)
 
     def described(self) -> dict[str, Any]:
-        """Return the camera, the depth format and facts, for JSON."""
+        """Return the camera, the depth format, facts and the eye, for JSON."""
+        own = {} if self.eye is None else {"eye": self.eye.described()}
         return {
             part: {"kind": type(value).__name__, **asdict(cast(Any, value))}
             for part, value in (("camera", self.optics), ("depth", self.depth_form))
-        } | dict(self.facts)
+        } | {**self.facts, **own}
 
 
 class BadFrame(ValueError):
@@ -298,6 +303,44 @@ class States:
                 f"--states: no line for frame '{lacking[0]}' ({len(lacking)} of "
                 f"{len(names)} frames are missing)"
             )
+
+
+@dataclass(frozen=True)
+class FrameEye:
+    """Eye of one frame, and its state.
+
+    Attributes
+    ----------
+    name : str
+        Name of the eye; frames with the same name have the same eye.
+    profile : EyeProfile
+        Parsed profile, or an eye of a bank.
+    given : mapping
+        The profile as it was given, as JSON-compatible values.
+    states : States
+        Pupil and focus of the frame.
+    gaze_deg : (h, v), optional
+        Gaze; by default that of the settings.
+    """
+
+    name: str
+    profile: EyeProfile
+    given: Mapping[str, Any]
+    states: States
+    gaze_deg: tuple[float, float] | None = None
+
+    def described(self) -> dict[str, Any]:
+        """Return the eye and its state, for JSON."""
+        state = self.states.described()
+        return {
+            "name": self.name,
+            "profile": dict(self.given),
+            "sha256": self.profile.digest,
+            "person": self.profile.sample,
+            "pupil_mm": state["pupil_mm"],
+            "focus_dpt": state["focus_dpt"],
+            "gaze_deg": self.gaze_deg,
+        }
 
 
 def read_states(

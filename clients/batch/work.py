@@ -6,7 +6,7 @@ import hashlib
 import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -15,7 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clients.batch.manifest import COUNTS, Record, below, write_whole
-from clients.batch.source import BadFrame, Constant, Scaled, SourceFrame, States
+from clients.batch.source import (
+    BadFrame,
+    Constant,
+    FrameEye,
+    Scaled,
+    SourceFrame,
+    States,
+)
 from clients.provenance import code_version, picture_metadata, profile_identity
 from estimator.bounded_files import read_bytes
 from filter_service import (
@@ -40,6 +47,7 @@ from filter_service.settings import MAX_PLANES
 
 if TYPE_CHECKING:
     from clients.batch.video_reading import VideoReader
+    from estimator import Eye
 
 
 FORMATS = ("png", "npy", "exr", "ffv1", "h264")
@@ -51,6 +59,12 @@ Format = Literal["png", "npy", "exr", "ffv1", "h264"]
 ATTEMPTS = 2
 PNG_LEVEL = 1
 """Files are a fifth larger than by default and take a quarter of the time."""
+
+EYES_FOLDER = "images"
+"""Folder of the results of frames that have eyes of their own."""
+
+LABEL_WAVELENGTH_NM = 555.0
+POWER_VECTOR = ("M_dpt", "J0_dpt", "J45_dpt")
 
 ARCMIN_PER_MRAD = 60.0 * math.degrees(1e-3)
 
@@ -191,6 +205,7 @@ class UnitRunner:
         self._failure: FilterError | None = None
         self._readers: dict[Path, VideoReader] = {}
         self._eye_notes: tuple[str, ...] | None = None  # of an eye without a record
+        self._quality: tuple[str, Eye | None] = "", None  # of the eye that frames use
         self.build_s = 0.0
 
     def close(self) -> None:
@@ -223,13 +238,14 @@ class UnitRunner:
             yield record | {"cpu_ms": _cpu_ms_since(cpu_s)}
 
     def _picture(self, profile: str, frame: SourceFrame) -> Record:
-        file = Path(profile) / f"{frame.name}.{self._job.format}"
+        folder = profile if frame.eye is None else EYES_FOLDER
+        file = Path(folder) / f"{frame.name}.{self._job.format}"
         try:
             color, grid, record = self._filtered(profile, frame)
             start_s = time.perf_counter()
             metadata = picture_metadata(
                 self._job.made_by,
-                profile_identity(profile, self._job.profiles[profile]),
+                self._identity(profile, frame),
                 pupil_diameter_mm=record["pupil_mm"],
                 focus_dpt=record["focus_dpt"],
                 more=self._more(profile, frame),
@@ -246,6 +262,11 @@ class UnitRunner:
             return _failed(profile, frame, error)
         record["ms"]["write"] = _ms_since(start_s)
         return {**record, "file": file.as_posix(), **written}
+
+    def _identity(self, profile: str, frame: SourceFrame) -> dict[str, str]:
+        if frame.eye is None:
+            return profile_identity(profile, self._job.profiles[profile])
+        return {"name": profile, "sha256": frame.eye.profile.digest}
 
     def _more(self, profile: str, frame: SourceFrame) -> Record:
         """Return facts for the metadata of a result whose image has facts."""
@@ -340,13 +361,15 @@ class UnitRunner:
                 f"{problem[1]}"
             )
         view = RgbdView(color.pixels, depth.pixels, frame.optics.tangents(color.grid))
-        pupil_mm, focus_dpt = self._job.states.of(frame.name, depth.pixels)
+        states = self._job.states if frame.eye is None else frame.eye.states
+        pupil_mm, focus_dpt = states.of(frame.name, depth.pixels)
         read_ms, start_s = _ms_since(start_s), time.perf_counter()
         built_s = self.build_s
-        seen = self._prepared(profile, view.camera).filter(
+        seen = self._prepared(profile, frame, view.camera).filter(
             view,
             pupil_diameter_mm=pupil_mm,
             focus_dpt=focus_dpt,
+            gaze_deg=None if frame.eye is None else frame.eye.gaze_deg,
             output=self._job.output,
             render_tolerance=self._job.render_tolerance,
         )
@@ -368,25 +391,57 @@ class UnitRunner:
         }
         if self.build_s > built_s:
             record["ms"]["build"] = 1e3 * (self.build_s - built_s)
+        if frame.eye is not None:
+            record["refraction"] = self._refraction(frame.eye, seen.pupil_diameter_mm)
         if self._eye_notes is not None:
             record["eye_notes"], self._eye_notes = [*self._eye_notes], None
         return seen.color, color.grid, record
 
-    def _prepared(self, profile: str, camera: Camera) -> EyeFilter:
+    def _refraction(self, eye: FrameEye, pupil_mm: float) -> dict[str, float] | None:
+        """Return the power vector of the relaxed eye at the cornea through a pupil.
+
+        It is None if light does not pass the eye there.
+        """
+        from estimator import Eye  # loads slowly
+
+        name, quality = self._quality
+        if name != eye.name or quality is None:
+            profile, age_years = eye.profile, self._job.settings.age_years
+            if age_years is not None:
+                profile = replace(profile, age_years=age_years)
+            quality = Eye(profile)
+            self._quality = eye.name, quality
+        try:
+            found = quality.refraction(
+                pupil_diameter_mm=pupil_mm, wavelength_nm=LABEL_WAVELENGTH_NM
+            )
+        except ValueError:
+            return None
+        if not np.isfinite(found.values).all():
+            return None
+        values = dict(zip(found.coords["quantity"].tolist(), found.values, strict=True))
+        return {name: round(float(values[name]), 5) for name in POWER_VECTOR}
+
+    def _prepared(self, profile: str, frame: SourceFrame, camera: Camera) -> EyeFilter:
         """Return the filter, prepared for a profile and for exactly a camera.
 
         With an eye prepared for similar cameras, images would depend on which camera
         came first.
         """
+        eye = frame.eye
         try:
-            self._open = found = self._open or EyeFilter(engine=self._job.engine)
+            # An eye of few images takes less time without a process of its own.
+            self._open = found = self._open or EyeFilter(
+                engine=self._job.engine, worker=eye is None
+            )
         except FilterError as error:
             raise EngineUnusable(str(error)) from None
         if self._key != (profile, camera):
             self._key = None
             for _ in range(ATTEMPTS):
                 self._failure = None
-                body, settings = self._job.profiles[profile], self._job.settings
+                body = self._job.profiles[profile] if eye is None else eye.profile
+                settings = self._job.settings
                 found.set_profile(body, settings=settings, views=camera)
                 try:
                     ready = found.wait()

@@ -24,6 +24,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, fields
+from functools import cached_property
 from pathlib import Path
 from queue import SimpleQueue
 from typing import Any, Self
@@ -237,6 +238,11 @@ class BankedEye(EyeProfile):
     """
 
     path: str = ""
+
+    @cached_property
+    def digest(self) -> str:
+        """Return the digest of the profile, which does not depend on the bank."""
+        return _plain(self).digest
 
     def store(self, spec: GridSpec) -> BankStore:
         """Return the store of the eye.
