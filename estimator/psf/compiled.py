@@ -151,12 +151,12 @@ class CompiledPsfs:
     def call(
         self, name: str, polynomials: NDArray[np.float64], *arrays: NDArray[np.float64]
     ) -> None:
-        """Call a function that takes threads, tables, a count and arrays.
+        """Call a function of pupils: of threads, tables, a count and arrays.
 
         The first array is polynomials (count, n_terms).
         """
         count, n_terms = polynomials.shape
-        tables, _ = psf_tables(n_terms)
+        tables, _ = psf_tables(n_terms, pupils_only=True)
         self.core.call(name, self.threads, tables, count, polynomials, *arrays)
 
     def _words(

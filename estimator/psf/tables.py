@@ -245,8 +245,8 @@ def polynomial_nodes(n_terms: int) -> NDArray[np.float64]:
     return np.array(points)
 
 
-def _wavefront_tables(n_terms: int) -> dict[str, NDArray[np.generic]]:
-    """Return the tables that depend on the number of Zernike terms."""
+def _pupil_tables(n_terms: int) -> dict[str, NDArray[np.generic]]:
+    """Return the tables that pupils with a number of Zernike terms need."""
     n_points = POINTS.shape[1]
     slopes = np.zeros((2, n_terms, -(-n_points // VECTOR) * VECTOR), np.float32)
     for padded, values in zip(slopes, _monomial_slopes(n_terms), strict=True):
@@ -255,6 +255,9 @@ def _wavefront_tables(n_terms: int) -> dict[str, NDArray[np.generic]]:
     nodes, (a, b) = polynomial_nodes(n_terms), exponents(n_terms).T
     from_nodes = np.linalg.inv(nodes[:, :1] ** a * nodes[:, 1:] ** b)
     return {
+        "edge_xy": POINTS[:, :N_EDGE].astype(np.float32),
+        "passed_powers": PASSED_POWERS,
+        "ring_weights": RING_WEIGHTS,
         "monomials": monomial_matrix(n_terms),
         "zernike_terms": inverse_monomial_matrix(n_terms),
         "node_xy": nodes.T,
@@ -274,10 +277,10 @@ def _with_changes(
 
 
 @cache
-def _common_tables(
+def _kernel_tables(
     filter_half_width: int, filter_count: int
 ) -> dict[str, NDArray[np.generic]]:
-    """Return the tables that depend on the sampling alone, or on nothing."""
+    """Return the tables that kernels need, but not pupils and their surveys."""
     filters = [pixel_filter(k + 1, filter_half_width) for k in range(filter_count)]
     stride = -(-filters[-1].size // VECTOR) * VECTOR
     table = np.zeros((filter_count, stride), np.float32)
@@ -288,9 +291,6 @@ def _common_tables(
     turns = np.concatenate([np.arange(n) / n for n in lengths])
     twiddles = np.stack([np.cos(2 * np.pi * turns), -np.sin(2 * np.pi * turns)], axis=1)
     contents: dict[str, NDArray[np.generic]] = {
-        "edge_xy": POINTS[:, :N_EDGE].astype(np.float32),
-        "passed_powers": PASSED_POWERS,
-        "ring_weights": RING_WEIGHTS,
         "fresnel": _with_changes(fresnel_table()),
         "edge_response": _with_changes(edge_response()),
         "pixel_filters": table,
@@ -307,6 +307,8 @@ def psf_tables(
     filter_half_width: int = 4,
     filter_count: int = FILTER_COUNT,
     rays_from_db: float = GEOMETRIC_FROM_DB,
+    *,
+    pupils_only: bool = False,
 ) -> tuple[PsfTables, dict[str, NDArray[np.generic]]]:
     """Return the tables of the engine, and the arrays that they point to.
 
@@ -320,11 +322,23 @@ def psf_tables(
         Largest number of samples per pixel.
     rays_from_db : float
         Predicted PSNR from which ray optics is used.
+    pupils_only : bool
+        Whether to omit the tables that only kernels need, for which SciPy is loaded.
+        Frames through the eyes of a bank need no others.
     """
-    arrays = _common_tables(filter_half_width, filter_count) | {
+    arrays = {
         name: np.ascontiguousarray(array)
-        for name, array in _wavefront_tables(n_terms).items()
+        for name, array in _pupil_tables(n_terms).items()
     }
+    counts = {}
+    if not pupils_only:
+        arrays |= _kernel_tables(filter_half_width, filter_count)
+        counts = {
+            "fresnel_count": len(arrays["fresnel"]),
+            "filter_stride": arrays["pixel_filters"].shape[1],
+            "filter_count": filter_count,
+            "length_count": FAST_LENGTHS.size,
+        }
     tables = PsfTables(
         **{name: pointer_to(array) for name, array in arrays.items()},
         cosine=COSINE_OF_TURNS,
@@ -345,15 +359,12 @@ def psf_tables(
         min_curvature_ratio=MIN_CURVATURE_RATIO,
         far_px=FAR_PX,
         near_px=NEAR_PX,
-        fresnel_count=len(arrays["fresnel"]),
         edge_half_width=EDGE_HALF_WIDTH,
         edge_steps=EDGE_STEPS,
-        filter_stride=arrays["pixel_filters"].shape[1],
-        filter_count=filter_count,
         filter_half_width=filter_half_width,
-        length_count=FAST_LENGTHS.size,
         n_rings=RING_WEIGHTS.size + 1,
         n_ring=N_RING,
         order=radial_order(n_terms),
+        **counts,
     )
     return tables, arrays

@@ -205,7 +205,8 @@ class SharedBuilder:
                     *(worker, limits, closing), engine=self._engine, current=current
                 )
                 self._closing.push(closing.pop_all())
-            preload()  # while the worker estimates the first eye
+            if self._has_worker:
+                preload()  # while it estimates the first eye
         self._n_users += 1
         return self._builder
 
