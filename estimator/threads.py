@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import sys
 import time
 from functools import cache
 from pathlib import Path
@@ -18,7 +19,10 @@ _CGROUP = Path("/sys/fs/cgroup")
 def thread_count() -> int:
     """Return the number of usable cores, capped by the container's CPU quota.
 
-    The environment variable ``OCUFILTER_THREADS`` overrides this number.
+    It is 1 in a process that `multiprocessing` started, such as a worker of a PyTorch
+    `DataLoader`: as a rule, others run beside it, and several processes with a thread
+    each need less processor time than one with several threads.  The environment
+    variable ``OCUFILTER_THREADS`` overrides both.
 
     Raises
     ------
@@ -32,7 +36,19 @@ def thread_count() -> int:
                 f"{THREADS_VARIABLE} is {wanted!r}; allowed: 1 to {MAX_THREADS}"
             )
         return int(wanted)
+    if _is_child():
+        return 1
     return max(1, min(_core_count(), _quota_cores(_CGROUP)))
+
+
+if hasattr(os, "register_at_fork"):  # a forked child of `multiprocessing` has another
+    os.register_at_fork(after_in_child=thread_count.cache_clear)
+
+
+def _is_child() -> bool:
+    """Return whether `multiprocessing`, which it then imports, started this process."""
+    processes = sys.modules.get("multiprocessing.process")
+    return processes is not None and processes.parent_process() is not None
 
 
 def _core_count() -> int:

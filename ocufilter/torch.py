@@ -79,7 +79,7 @@ class SeeThrough(torch.nn.Module):
         As for `EyeFilter.operator`.
     accuracy : "normal" or "fine"
         Accuracy of gradients by pupil and focus, as for `image_derivatives`.
-    worker : bool
+    worker : bool, optional
         As for `EyeFilter`.
 
     Raises
@@ -100,7 +100,7 @@ class SeeThrough(torch.nn.Module):
         settings: FilterSettings | Mapping[str, Any] = FilterSettings(),  # noqa: B008
         render_tolerance: float = 1.0,
         accuracy: str = "normal",
-        worker: bool = True,
+        worker: bool | None = None,
     ) -> None:
         super().__init__()
         self.profile, self.camera, self.settings = profile, camera, settings

@@ -32,9 +32,17 @@ from clients.figures import (
 from clients.figures.curves import blur_arcmin, draw_field_map
 from clients.figures.style import new_figure
 from clients.web.picture import png_of
-from estimator import EyeOptics, Rings, compute_psfs, parse_profile, prepare_eye
+from estimator import (
+    EyeOptics,
+    Rings,
+    compute_psfs,
+    parse_profile,
+    prepare_eye,
+    thread_count,
+)
 from filter_service import FilterError
 
+THREADS_VARIABLE = "OCUFILTER_THREADS"
 DOTS_PER_INCH = 220
 FIGURE_TITLES = {
     "wavefront": "Wavefront",
@@ -97,7 +105,9 @@ class FigureWorker:
         context = multiprocessing.get_context("spawn")
         self._connection, theirs = context.Pipe()
         # not a daemon: a report starts its own worker
-        self._process = context.Process(target=_serve_requests, args=(theirs,))
+        self._process = context.Process(
+            target=_serve_requests, args=(theirs, thread_count())
+        )
         self._process.start()
         theirs.close()
 
@@ -152,8 +162,9 @@ class FigureWorker:
         self._process.join()
 
 
-def _serve_requests(connection: Connection) -> None:
-    """Handle requests until the parent process ends."""
+def _serve_requests(connection: Connection, n_threads: int) -> None:
+    """Handle requests until the parent process ends, on as many threads as it has."""
+    os.environ.setdefault(THREADS_VARIABLE, str(n_threads))
     os.nice(NICENESS)
     while True:
         try:

@@ -260,6 +260,9 @@ def shared_threads() -> int:
     return core().new_threads(thread_count())
 
 
+os.register_at_fork(after_in_child=shared_threads.cache_clear)  # it may use fewer
+
+
 @cache
 def core() -> Core:
     """Return the compiled core, loaded once; see `selected`.

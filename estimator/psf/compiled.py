@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import os
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -184,3 +185,6 @@ def compiled_psfs() -> CompiledPsfs:
         If the core was not built.
     """
     return CompiledPsfs(core(), shared_threads())
+
+
+os.register_at_fork(after_in_child=compiled_psfs.cache_clear)

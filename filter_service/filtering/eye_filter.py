@@ -13,17 +13,13 @@ import math
 import os
 import time
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Literal, Self, Unpack
+from typing import TYPE_CHECKING, Any, Literal, NoReturn, Self, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
 
 from filter_service.camera import Camera
-from filter_service.errors import (
-    BadMessage,
-    RenderFailed,
-    ServiceTimeout,
-)
+from filter_service.errors import BadMessage, RenderFailed, ServiceTimeout
 from filter_service.filter_protocol import Filter
 from filter_service.filtering.builder import Builder
 from filter_service.filtering.operator import (
@@ -99,9 +95,10 @@ class EyeFilter:
     gl_context : "own" or "current"
         OpenGL context of the engine gl: one of its own, or the one that is current now,
         as `filter_textures` requires.  The latter must be current for every call.
-    worker : bool
-        Whether a process of its own estimates eyes.  Without one, calls that wait for
-        an eye estimate it, which takes less processor time if each eye has few images.
+    worker : bool, optional
+        Whether a process of its own estimates eyes; by default except in a daemonic
+        process, such as a worker of a PyTorch `DataLoader`.  Without one, calls that
+        wait for an eye estimate it: less processor time if each eye has few images.
 
     Raises
     ------
@@ -123,7 +120,7 @@ class EyeFilter:
         first_generation: int = 1,
         engine: Engine = "auto",
         gl_context: Literal["own", "current"] = "own",
-        worker: bool = True,
+        worker: bool | None = None,
     ) -> None:
         first = None if profile is None else as_profile(profile)
         self.cameras = as_cameras(camera)
@@ -161,6 +158,10 @@ class EyeFilter:
     def __exit__(self, *exc_info: object) -> None:
         """Release the filter's resources."""
         self.close()
+
+    def __reduce__(self) -> NoReturn:
+        """Raise a TypeError."""
+        raise TypeError("an EyeFilter cannot be pickled; open one in each process")
 
     def close(self) -> None:
         """Release the filter's resources; further calls do nothing."""

@@ -9,6 +9,7 @@ import threading
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import cache
+from multiprocessing import current_process
 from typing import TYPE_CHECKING, Any
 
 from filter_service.building.jobs import BuildLimits, default_cache_dir
@@ -233,9 +234,14 @@ def shared(engine: str, context: int = 0, *, has_worker: bool = True) -> SharedB
 
 
 def acquired(
-    engine: Engine, gl_context: str, *, worker: bool = True
+    engine: Engine, gl_context: str, *, worker: bool | None = None
 ) -> tuple[Builder, SharedBuilder]:
-    """Return the shared builder of an engine and a context, with a reference."""
+    """Return the shared builder of an engine and a context, with a reference.
+
+    By default it has a worker process, unless this process must not have children.
+    """
+    if worker is None:
+        worker = not current_process().daemon
     if gl_context not in GL_CONTEXTS:
         raise BadMessage(
             f"{gl_context!r}", field="gl_context", allowed=" or ".join(GL_CONTEXTS)

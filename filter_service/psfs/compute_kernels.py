@@ -7,6 +7,7 @@ processor time, because each PSF must be surveyed before it is dispatched.
 
 from __future__ import annotations
 
+import os
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -72,6 +73,9 @@ def psf_engine(pipeline: str = "exact", threads: int | None = None) -> PsfEngine
         series = partial(compute_psf_batch, method="enz_unchecked")
         return PsfEngine(series, thread_count())
     return PsfEngine(compute_psf_batch, NATIVE_BATCH, native_psfs(threads))
+
+
+os.register_at_fork(after_in_child=psf_engine.cache_clear)
 
 
 def computed_kernels(

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import os
 from collections import Counter
 from dataclasses import dataclass, replace
 from functools import cache
@@ -192,3 +193,6 @@ def native_psfs(threads: int | None = None) -> NativePsfs:
     if threads is not None:
         engine = replace(engine, threads=engine.core.new_threads(threads))
     return NativePsfs(engine)
+
+
+os.register_at_fork(after_in_child=native_psfs.cache_clear)

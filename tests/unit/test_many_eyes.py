@@ -1,5 +1,9 @@
 """A new eye for each image: without a worker process, and in ranges of one state."""
 
+import multiprocessing
+import pickle
+import sys
+
 import numpy as np
 import pytest
 
@@ -52,6 +56,39 @@ def test_images_do_not_depend_on_the_worker(frame):
             found.append([seen(eye_filter, frame, number) for number in (1, 2)])
     np.testing.assert_array_equal(*found)
     assert np.any(found[0][0] != found[0][1])  # two persons
+
+
+def send_image(sender, frame):
+    """Send an image, and whether a process estimated its eye (a child)."""
+    with EyeFilter(camera=CAMERA, settings=SETTINGS, engine="native") as eye_filter:
+        image = seen(eye_filter, frame, 1)
+        sender.send((image, eye_filter.builder.worker.has_process))
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="forks")
+@pytest.mark.long("builds an eye twice")
+@pytest.mark.parametrize("method", ["fork", "spawn"])
+def test_daemonic_processes_start_none(frame, method):
+    context = multiprocessing.get_context(method)
+    receiver, sender = context.Pipe(duplex=False)
+    child = context.Process(target=send_image, args=(sender, frame), daemon=True)
+    with EyeFilter(
+        camera=CAMERA, settings=SETTINGS, engine="native", worker=False
+    ) as eye_filter:
+        expected = seen(eye_filter, frame, 1)
+        child.start()
+        image, has_process = receiver.recv()
+        child.join()
+    assert not has_process
+    np.testing.assert_array_equal(image, expected)
+
+
+def test_a_filter_refuses_to_be_pickled():
+    with (
+        EyeFilter(engine="native", worker=False) as eye_filter,
+        pytest.raises(TypeError, match="open one in each process"),
+    ):
+        pickle.dumps(eye_filter)
 
 
 def test_builders_with_and_without_a_worker_are_shared_apart():

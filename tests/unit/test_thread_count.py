@@ -1,10 +1,16 @@
 """Number of threads of this process."""
 
+import multiprocessing
 import os
+import sys
 
 import pytest
 
 from estimator import threads
+from estimator.native import core, shared_threads
+from estimator.psf.compiled import compiled_psfs
+
+linux = pytest.mark.skipif(sys.platform != "linux", reason="forks")
 
 
 @pytest.fixture(autouse=True)
@@ -47,3 +53,35 @@ def test_a_setting_says_another_number(monkeypatch):
         threads.thread_count.cache_clear()
         with pytest.raises(ValueError, match="1 to 256"):
             threads.thread_count()
+
+
+def send_counts(sender):
+    """Send the numbers of threads of settings, of C loops, and of PSFs (a child)."""
+    handles = shared_threads(), compiled_psfs().threads
+    sender.send([threads.thread_count(), *map(core().thread_count, handles)])
+
+
+def counts_of_child(method):
+    context = multiprocessing.get_context(method)
+    receiver, sender = context.Pipe(duplex=False)
+    child = context.Process(target=send_counts, args=(sender,))
+    child.start()
+    found = receiver.recv()
+    child.join()
+    return found
+
+
+@linux
+@pytest.mark.parametrize(
+    "method",
+    ["fork", pytest.param("spawn", marks=pytest.mark.long("starts an interpreter"))],
+)
+def test_processes_of_multiprocessing_use_one_thread(monkeypatch, method):
+    """Even if they were forked from one that uses more, unless a variable says so."""
+    shared_threads(), compiled_psfs()
+    threads.thread_count.cache_clear()
+    monkeypatch.setattr(os, "sched_getaffinity", lambda pid: set(range(3)))
+    assert threads.thread_count() > 1 or threads._quota_cores(threads._CGROUP) == 1
+    assert counts_of_child(method) == [1, 1, 1]
+    monkeypatch.setenv(threads.THREADS_VARIABLE, "2")
+    assert counts_of_child(method) == [2, 2, 2]
