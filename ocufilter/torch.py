@@ -12,17 +12,21 @@ does.
 
 from __future__ import annotations
 
+import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.sparse.linalg import lsqr
+from numpy.typing import ArrayLike, NDArray
 
+from estimator.media import LUMINANCE
 from filter_service import (
     Camera,
     EyeFilter,
+    FilterError,
     FilterOperator,
     FilterSettings,
     RgbdView,
@@ -53,22 +57,29 @@ class SeeThrough(torch.nn.Module):
     CPU, in float32, and returns the type and device of its input.  Results do not
     depend on the number of threads, nor on the other items of a batch.
 
+    Gray colors (..., 1, height, width) or (height, width) are the same light in all
+    channels.  Their images are gray, too: the luminance of the sRGB primaries.
+
+    Profile, pupil, focus and depth may differ for each item of a batch (n, ..., 3,
+    height, width): assign sequences of n profiles, such as `EyeBank` returns, sequences
+    or tensors (n,) of numbers, or depth (n, height, width).
+
     The methods have the names of linear operators in deepinv: ``A``, ``A_adjoint`` and
     ``A_dagger``.
 
     The module can be pickled and passed to workers.  Each process opens its own filter
-    when it first needs it, which takes a second or two.
+    when it first needs it, which takes up to a second.
 
     Parameters
     ----------
-    profile : EyeProfile, mapping, str or Path
+    profile : EyeProfile, mapping, str or Path, or sequence of them
         Profile, as for `EyeFilter`.  Assign another one to the attribute of the same
-        name to see through another eye, such as one of an `EyeBank` for each sample.
+        name to see through another eye.
     camera : Camera
-    depth_m : (height, width) float32, RgbdView, or sequence of RgbdView
+    depth_m : (height, width) or (n, height, width) float32, RgbdView, or sequence of it
         Depth, as for `EyeFilter.operator`.  Assign another array to the attribute of
         the same name to filter another scene.
-    pupil_diameter_mm, focus_dpt : float or scalar tensor
+    pupil_diameter_mm, focus_dpt : float, scalar tensor, or (n,) of them
         State of the eye; other values may be assigned to the attributes.  Tensors that
         require gradients, such as parameters, get those of `image_derivatives`, which
         take seconds and cannot be differentiated again.
@@ -85,7 +96,9 @@ class SeeThrough(torch.nn.Module):
     Raises
     ------
     BadMessage
-        When it is first used: a parameter is invalid (a ValueError, too).
+        When it is first used: a parameter is invalid (a ValueError, too).  If it is
+        that of one item of a batch, the message begins with its number:
+        ``samples[3].focus_dpt``.
     """
 
     def __init__(
@@ -94,8 +107,8 @@ class SeeThrough(torch.nn.Module):
         camera: Camera,
         depth_m: NDArray[Any] | RgbdView | Sequence[RgbdView],
         *,
-        pupil_diameter_mm: float | torch.Tensor,
-        focus_dpt: float | torch.Tensor,
+        pupil_diameter_mm: float | Sequence[float] | torch.Tensor,
+        focus_dpt: float | Sequence[float] | torch.Tensor,
         gaze_deg: tuple[float, float] | None = None,
         settings: FilterSettings | Mapping[str, Any] = FilterSettings(),  # noqa: B008
         render_tolerance: float = 1.0,
@@ -109,7 +122,7 @@ class SeeThrough(torch.nn.Module):
         self.render_tolerance, self.accuracy = render_tolerance, accuracy
         self.worker = worker
         self._filter: EyeFilter | None = None
-        self._made: tuple[Any, dict[str, Any], FilterOperator] | None = None
+        self._made: list[tuple[_Sample, FilterOperator]] = []
         self._opened_profile: Any = None
         self._pid = 0
 
@@ -118,19 +131,23 @@ class SeeThrough(torch.nn.Module):
         return self.A(color)
 
     def A(self, color: torch.Tensor) -> torch.Tensor:  # noqa: N802
-        """Return the images (..., 3, height, width) of colors.
+        """Return the images (..., 3, height, width) of colors, or gray ones of gray.
 
         Raises
         ------
         ValueError
             If the tensor has another shape, or is not real and floating-point.
         """
-        state = self.pupil_diameter_mm, self.focus_dpt
-        image = _Applied.apply(color, self.operator(), False)
-        if any(isinstance(value, torch.Tensor) for value in state):
-            values = [torch.as_tensor(value) for value in state]
-            return _OfState.apply(image, color, self, *values)
-        return image
+
+        def image_of(own: torch.Tensor, sample: _Sample) -> torch.Tensor:
+            image = _Applied.apply(own, self._operator_of(sample, own), False)
+            state = sample.pupil_diameter_mm, sample.focus_dpt
+            if any(isinstance(value, torch.Tensor) for value in state):
+                values = [torch.as_tensor(value) for value in state]
+                image = _OfState.apply(image, own, self, sample, *values)
+            return image
+
+        return self._by_sample(color, image_of)
 
     def A_adjoint(self, image: torch.Tensor) -> torch.Tensor:  # noqa: N802
         """Return the transpose of the operator, applied to images.
@@ -140,7 +157,14 @@ class SeeThrough(torch.nn.Module):
         ValueError
             As `A`.
         """
-        return _Applied.apply(image, self.operator(), True)
+
+        def color_of(own: torch.Tensor, sample: _Sample) -> torch.Tensor:
+            found: torch.Tensor = _Applied.apply(
+                own, self._operator_of(sample, own), True
+            )
+            return found
+
+        return self._by_sample(image, color_of)
 
     def A_dagger(  # noqa: N802
         self, image: torch.Tensor, *, max_iter: int = 50, tol: float = 1e-4
@@ -163,77 +187,163 @@ class SeeThrough(torch.nn.Module):
         ValueError
             As `A`.
         """
-        operator = self.operator()
-        matrix = operator.as_linear_operator()
+        from scipy.sparse.linalg import lsqr  # loads slowly
 
-        def solved(own: NDArray[np.float32]) -> NDArray[np.float32]:
-            found = lsqr(matrix, own.ravel(), atol=tol, btol=tol, iter_lim=max_iter)[0]
-            return found.astype(np.float32).reshape(operator.color_shape)
+        def color_of(own: torch.Tensor, sample: _Sample) -> torch.Tensor:
+            operator = self._operator_of(sample, own)
+            matrix = operator.as_linear_operator()
 
-        return _each(image, solved, operator.image_shape, operator.color_shape)
+            def solved(array: NDArray[np.float32]) -> NDArray[np.float32]:
+                found = lsqr(
+                    matrix, array.ravel(), atol=tol, btol=tol, iter_lim=max_iter
+                )[0]
+                return found.astype(np.float32).reshape(operator.color_shape)
 
-    def operator(self) -> FilterOperator:
-        """Return the operator of the module's depth and state, kept until these change.
+            return _each(own, solved, operator.image_shape, operator.color_shape)
+
+        return self._by_sample(image, color_of)
+
+    def operator(self, sample: int = 0) -> FilterOperator:
+        """Return the operator of the depth and state, kept until these change.
+
+        Parameters
+        ----------
+        sample : int
+            Item of a batch, if they have parameters of their own.
 
         Raises
         ------
         BadMessage
             As `EyeFilter.operator`.
         """
-        eye_filter = self._opened()
-        state: dict[str, Any] = {
-            "pupil_diameter_mm": _number(self.pupil_diameter_mm),
-            "focus_dpt": _number(self.focus_dpt),
-            "gaze_deg": self.gaze_deg,
-            "render_tolerance": self.render_tolerance,
+        samples = self._samples()
+        return self._operator(samples[range(len(samples))[sample]])
+
+    def _by_sample(
+        self,
+        given: torch.Tensor,
+        function: Callable[[torch.Tensor, _Sample], torch.Tensor],
+    ) -> torch.Tensor:
+        """Apply a function to a batch, or to each item with parameters of its own."""
+        if not isinstance(given, torch.Tensor) or not given.is_floating_point():
+            kind = getattr(given, "dtype", type(given).__name__)
+            raise ValueError(f"expected a tensor of floats in linear light, got {kind}")
+        if given.ndim == 2:  # gray
+            return self._by_sample(given[None], function)[0]
+        samples = self._samples()
+        if samples[0].number is None:
+            return function(given, samples[0])
+        if given.ndim < 4 or len(given) != len(samples):
+            raise ValueError(
+                f"expected a batch of {len(samples)} items, which have parameters of "
+                f"their own, got {tuple(given.shape)}"
+            )
+        return torch.stack(
+            [function(own, one) for own, one in zip(given, samples, strict=True)]
+        )
+
+    def _samples(self) -> list[_Sample]:
+        """Return the parameters of all items together, or of each item.
+
+        Raises
+        ------
+        ValueError
+            If they are of different numbers of items.
+        """
+        values = {
+            "profile": self.profile,
+            "depth_m": self.depth_m,
+            "pupil_diameter_mm": self.pupil_diameter_mm,
+            "focus_dpt": self.focus_dpt,
         }
-        made = self._made
-        if made is not None and made[0] is self.depth_m and made[1] == state:
-            return made[2]
-        self._made = None  # its memory goes first
-        found = eye_filter.operator(self.depth_m, **state)
-        self._made = self.depth_m, state, found
+        counts = {
+            name: len(value) for name, value in values.items() if _is_many(name, value)
+        }
+        if len(set(counts.values())) > 1 or 0 in counts.values():
+            told = ", ".join(f"{name} of {count}" for name, count in counts.items())
+            raise ValueError(f"expected parameters of the same items, got {told}")
+
+        def of_item(number: int | None) -> _Sample:
+            own = {
+                name: value[number] if name in counts else value
+                for name, value in values.items()
+            }
+            constant = self.gaze_deg, self.render_tolerance
+            return _Sample(number, values["depth_m"], constant, **own)
+
+        if not counts:
+            return [of_item(None)]
+        return [of_item(number) for number in range(next(iter(counts.values())))]
+
+    def _operator_of(self, sample: _Sample, given: torch.Tensor) -> FilterOperator:
+        """Return the operator of a sample, for gray if a given tensor is."""
+        operator = self._operator(sample)
+        return _GrayOperator(operator) if _is_gray(given) else operator
+
+    def _operator(self, sample: _Sample) -> FilterOperator:
+        self._leave_parent()
+        for known, operator in self._made:
+            if sample.is_same(known):
+                return operator
+        samples = self._samples()
+        self._made = [  # the memory of the others goes first
+            made for made in self._made if any(map(made[0].is_same, samples))
+        ]
+        eye_filter = self._opened(sample)
+        with sample.named_errors():
+            found = eye_filter.operator(
+                sample.depth_m,
+                pupil_diameter_mm=_number(sample.pupil_diameter_mm),
+                focus_dpt=_number(sample.focus_dpt),
+                gaze_deg=self.gaze_deg,
+                render_tolerance=self.render_tolerance,
+            )
+        self._made.append((sample.plain(), found))
         return found
 
     def _derivatives(
-        self,
-        color: torch.Tensor,
-        names: list[str],
-        depth_m: Any,
-        pupil_diameter_mm: float,
-        focus_dpt: float,
+        self, color: torch.Tensor, names: list[str], sample: _Sample
     ) -> dict[str, torch.Tensor]:
         """Return the derivatives of images by pupil or focus."""
         if not names:
             return {}
+        is_gray = _is_gray(color)
         arrays = color.detach().to("cpu", torch.float32).movedim(-3, -1).numpy()
-        found = image_derivatives(
-            self._opened(),
-            np.ascontiguousarray(arrays),
-            depth_m,
-            names,
-            pupil_diameter_mm=pupil_diameter_mm,
-            focus_dpt=focus_dpt,
-            gaze_deg=self.gaze_deg,
-            accuracy=self.accuracy,
-        )
+        if is_gray:
+            arrays = np.repeat(arrays, len(LUMINANCE), axis=-1)
+        with sample.named_errors():
+            found = image_derivatives(
+                self._opened(sample),
+                np.ascontiguousarray(arrays),
+                sample.depth_m,
+                names,
+                pupil_diameter_mm=_number(sample.pupil_diameter_mm),
+                focus_dpt=_number(sample.focus_dpt),
+                gaze_deg=self.gaze_deg,
+                accuracy=self.accuracy,
+            )
         return {
-            name: torch.from_numpy(image).movedim(-1, -3)
-            for name, image in found.items()
+            name: torch.from_numpy(_luminance(own) if is_gray else own).movedim(-1, -3)
+            for name, own in found.items()
         }
 
-    def _opened(self) -> EyeFilter:
-        if self._pid != os.getpid():  # threads do not survive a fork
+    def _leave_parent(self) -> None:
+        """Forget the filter of the parent process: threads do not survive a fork."""
+        if self._pid != os.getpid():
             self._forget()
             self._pid = os.getpid()
-        if self._filter is None:
-            self._filter = EyeFilter(
-                self.profile, self.camera, self.settings, worker=self.worker
-            )
-        elif self.profile is not self._opened_profile:
-            self._made = None
-            self._filter.set_profile(self.profile)
-        self._opened_profile = self.profile
+
+    def _opened(self, sample: _Sample) -> EyeFilter:
+        """Return the filter, with the profile of a sample."""
+        self._leave_parent()
+        with sample.named_errors():
+            if self._filter is None:
+                self._filter = EyeFilter(
+                    sample.profile, self.camera, self.settings, worker=self.worker
+                )
+            elif sample.profile is not self._opened_profile:
+                self._filter.set_profile(sample.profile)
+        self._opened_profile = sample.profile
         return self._filter
 
     def close(self) -> None:
@@ -243,11 +353,116 @@ class SeeThrough(torch.nn.Module):
         self._forget()
 
     def _forget(self) -> None:
-        self._filter, self._made, self._pid = None, None, 0
+        self._filter, self._made, self._pid = None, [], 0
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the state to pickle, without the filter and the operator."""
-        return {**self.__dict__, "_filter": None, "_made": None, "_pid": 0}
+        return {**self.__dict__, "_filter": None, "_made": [], "_pid": 0}
+
+
+@dataclass(frozen=True, eq=False)
+class _Sample:
+    """Parameters of all items of a batch, or of one.
+
+    Attributes
+    ----------
+    number : int or None
+        Number of the item; None for all.
+    depths_m : object
+        Depth of all items, by which depth is identified.
+    constant : tuple
+        Parameters that are the same for all items.
+    profile, depth_m, pupil_diameter_mm, focus_dpt : object
+        As for `SeeThrough`, of this item.
+    """
+
+    number: int | None
+    depths_m: Any
+    constant: tuple[Any, ...]
+    profile: Any
+    depth_m: Any
+    pupil_diameter_mm: Any
+    focus_dpt: Any
+
+    def is_same(self, other: _Sample) -> bool:
+        """Return whether another sample has the same operator."""
+        is_own_depth = self.depth_m is not self.depths_m
+        return (
+            self.profile is other.profile
+            and self.depths_m is other.depths_m
+            and (not is_own_depth or self.number == other.number)
+            and self.constant == other.constant
+            and _number(self.pupil_diameter_mm) == _number(other.pupil_diameter_mm)
+            and _number(self.focus_dpt) == _number(other.focus_dpt)
+        )
+
+    def plain(self) -> _Sample:
+        """Return the sample with numbers instead of tensors, which may change."""
+        return replace(
+            self,
+            pupil_diameter_mm=_number(self.pupil_diameter_mm),
+            focus_dpt=_number(self.focus_dpt),
+        )
+
+    @contextmanager
+    def named_errors(self) -> Iterator[None]:
+        """Add the number of the item to errors."""
+        try:
+            yield
+        except (FilterError, ValueError) as error:
+            if self.number is None:
+                raise
+            where = f"samples[{self.number}]"
+            if not isinstance(error, FilterError):
+                raise ValueError(f"{where}: {error}") from error
+            field = where if error.field is None else f"{where}.{error.field}"
+            raise type(error)(
+                error.message, field=field, allowed=error.allowed
+            ) from error
+
+
+def _is_many(name: str, value: Any) -> bool:
+    """Return whether a parameter has a value for each item of a batch."""
+    if isinstance(value, torch.Tensor | np.ndarray):
+        return value.ndim == (3 if name == "depth_m" else 1)
+    # a sequence of depths is one of views, which are filtered together
+    return (
+        name != "depth_m" and isinstance(value, Sequence) and not isinstance(value, str)
+    )
+
+
+def _is_gray(given: torch.Tensor) -> bool:
+    return given.ndim > 2 and given.shape[-3] == 1
+
+
+def _luminance(image: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return the luminance (..., 1) of images (..., 3)."""
+    weighed = image * np.array(LUMINANCE, np.float32)
+    found: NDArray[np.float32] = weighed.sum(axis=-1, keepdims=True)
+    return found
+
+
+class _GrayOperator(FilterOperator):
+    """The luminance of the images of gray colors."""
+
+    def __init__(self, operator: FilterOperator) -> None:
+        self._operator = operator
+        self.color_shape = (*operator.color_shape[:-1], 1)
+        self.image_shape = (*operator.image_shape[:-1], 1)
+        self.shape = math.prod(self.image_shape), math.prod(self.color_shape)
+
+    def forward(self, color: ArrayLike) -> NDArray[np.float32]:
+        """Return the image (..., 1) of a color (..., 1)."""
+        channels = np.repeat(np.asarray(color), len(LUMINANCE), axis=-1)
+        return _luminance(self._operator.forward(channels))
+
+    def adjoint(self, image: ArrayLike) -> NDArray[np.float32]:
+        """Return the transpose of the operator times an image (..., 1)."""
+        weighed = np.asarray(image) * np.array(LUMINANCE, np.float32)
+        found: NDArray[np.float32] = self._operator.adjoint(weighed).sum(
+            axis=-1, keepdims=True
+        )
+        return found
 
 
 def _number(value: float | torch.Tensor) -> float:
@@ -263,10 +478,10 @@ class _OfState(torch.autograd.Function):
         image: torch.Tensor,
         color: torch.Tensor,
         see: SeeThrough,
-        *state: torch.Tensor,
+        sample: _Sample,
+        *_state: torch.Tensor,
     ) -> torch.Tensor:
-        ctx.see, ctx.state = see, [value.item() for value in state]
-        ctx.depth_m = see.depth_m
+        ctx.see, ctx.sample = see, sample.plain()
         ctx.save_for_backward(color)
         return image.clone()
 
@@ -275,17 +490,15 @@ class _OfState(torch.autograd.Function):
     def backward(ctx: Any, gradient: torch.Tensor) -> tuple[Any, ...]:
         needed = [
             name
-            for name, is_needed in zip(STATE, ctx.needs_input_grad[3:], strict=True)
+            for name, is_needed in zip(STATE, ctx.needs_input_grad[4:], strict=True)
             if is_needed
         ]
-        found = ctx.see._derivatives(
-            ctx.saved_tensors[0], needed, ctx.depth_m, *ctx.state
-        )
+        found = ctx.see._derivatives(ctx.saved_tensors[0], needed, ctx.sample)
         by_state = [
             (found[name].to(gradient) * gradient).sum() if name in found else None
             for name in STATE
         ]
-        return gradient, None, None, *by_state
+        return gradient, None, None, None, *by_state
 
 
 class _Applied(torch.autograd.Function):
@@ -315,13 +528,10 @@ def _each(
     """Apply a function of arrays of a shape to each item of a batch."""
     n_items = len(shape)
     expected = _channels_first(shape)
-    if not isinstance(given, torch.Tensor) or not given.is_floating_point():
-        kind = getattr(given, "dtype", type(given).__name__)
-        raise ValueError(f"expected a tensor of floats in linear light, got {kind}")
     if tuple(given.shape[-n_items:]) != expected:
+        told = ", ".join(map(str, expected))
         raise ValueError(
-            f"expected a tensor of shape (..., {', '.join(map(str, expected))}), "
-            f"got {tuple(given.shape)}"
+            f"expected a tensor of shape (..., {told}), got {tuple(given.shape)}"
         )
     batch = given.shape[:-n_items]
     arrays = given.detach().to("cpu", torch.float32).movedim(-3, -1)

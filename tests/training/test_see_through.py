@@ -10,6 +10,7 @@ import pytest
 import torch
 from torch.utils.data import DataLoader, Dataset
 
+from estimator import thread_count
 from filter_service import (
     Camera,
     EyeBank,
@@ -79,6 +80,151 @@ def test_each_sample_may_have_another_eye_of_a_bank(tmp_path):
     other.close()
     torch.testing.assert_close(images[2], images[0], rtol=0.0, atol=0.0)
     assert (images[1] - images[0]).abs().max() > 0.01
+
+
+EYES = [{"kind": "prescription", "sphere_dpt": -1.0}, "emmetropia"]
+PUPILS_MM, FOCI_DPT = [4.0, 3.0], torch.tensor([0.5, 1.0])
+DEPTHS_M = np.stack([DEPTH_M, DEPTH_M[:, ::-1]])
+MANY = {"pupil_diameter_mm": PUPILS_MM, "focus_dpt": FOCI_DPT, "settings": SETTINGS}
+
+
+@pytest.fixture(scope="module")
+def two():
+    """Return a module with two eyes, states and depths."""
+    module = SeeThrough(EYES, CAMERA, DEPTHS_M, **MANY, worker=False)
+    yield module
+    module.close()
+
+
+def single(see, number):
+    """Return a module with the parameters of one of the items."""
+    return SeeThrough(
+        *(EYES[number], CAMERA, np.ascontiguousarray(DEPTHS_M[number])),
+        pupil_diameter_mm=PUPILS_MM[number],
+        focus_dpt=FOCI_DPT[number].item(),
+        settings=SETTINGS,
+        worker=False,
+    )
+
+
+@pytest.mark.parametrize("method", ["A", "A_adjoint", "A_dagger"])
+def test_items_of_a_batch_may_have_eyes_states_and_depths_of_their_own(two, method):
+    color = rand(2, 2)
+    images = getattr(two, method)(color)
+    for number in range(2):
+        one = single(two, number)
+        assert torch.equal(images[number], getattr(one, method)(color[number]))
+        assert not torch.equal(
+            images[1 - number], getattr(one, method)(color[1 - number])
+        )
+        one.close()
+    assert torch.equal(getattr(two, method)(color), images)
+    assert torch.equal(getattr(pickle.loads(pickle.dumps(two)), method)(color), images)
+
+
+def test_operators_of_items_are_kept_until_their_parameters_change(two):
+    first = [two.operator(number) for number in range(2)]
+    own = copy.deepcopy(two)
+    for parameters, n_kept in (({}, 2), ({"pupil_diameter_mm": [4.0, 4.0]}, 1)):
+        for name, value in parameters.items():
+            setattr(two, name, value)
+        again = [two.operator(number) for number in range(2)]
+        assert sum(a is b for a, b in zip(first, again, strict=True)) == n_kept
+    two.pupil_diameter_mm = PUPILS_MM
+    with pytest.raises(IndexError):
+        two.operator(2)
+    own.close()
+
+
+@pytest.mark.parametrize("shape", [(2, 3), (2, 1)])
+@pytest.mark.parametrize("method", ["A", "A_adjoint"])
+def test_gradients_of_two_eyes_by_the_image(two, method, shape):
+    given = rand(2)[:, : shape[1]].double().requires_grad_()
+    function = getattr(two, method)
+    torch.autograd.gradcheck(function, given, eps=1e-2, atol=1e-4, rtol=1e-4)
+
+
+def test_gradients_of_two_eyes_by_their_foci(two):
+    """They are those of each eye, also if the next sample comes before `backward`."""
+    color = rand(2, seed=4)
+    foci_dpt = torch.tensor([3.2, 3.4], requires_grad=True)
+    own = copy.deepcopy(two)
+    own.focus_dpt = foci_dpt
+    loss = own(color).square().sum()
+    own.focus_dpt, own.profile = FOCI_DPT, EYES[::-1]
+    own(color)
+    loss.backward()
+    own.close()
+    for number in range(2):
+        one = single(two, number)
+        one.focus_dpt = foci_dpt[number].detach().requires_grad_()
+        one(color[number]).square().sum().backward()
+        torch.testing.assert_close(one.focus_dpt.grad, foci_dpt.grad[number])
+        assert abs(one.focus_dpt.grad) > 0.01
+        one.close()
+
+
+def test_wrong_parameters_name_their_item(two):
+    color = rand(2)
+    for name, values, message in (
+        (
+            "pupil_diameter_mm",
+            [4.0, 40.0],
+            r"samples\[1\].pupil_diameter_mm: it is 40.0",
+        ),
+        ("focus_dpt", torch.tensor([-1.0, 1.0]), r"samples\[0\].focus_dpt: it is -1.0"),
+        ("profile", ["myopia", "no such eye"], r"samples\[1\]: .*no such eye"),
+        ("profile", ["myopia", {"kind": "new"}], r"samples\[1\]: .*new"),
+        ("profile", EYES[:1], "same items, got profile of 1, depth_m of 2"),
+        ("profile", [], "same items, got profile of 0"),
+    ):
+        own = copy.deepcopy(two)
+        setattr(own, name, values)
+        with pytest.raises(ValueError, match=message):
+            own(color)
+        own.close()
+    for wrong in (rand(), rand(3), rand(1, 2)):
+        with pytest.raises(ValueError, match=r"expected a batch of 2 items"):
+            two(wrong)
+
+
+def test_gray_images_are_the_luminance_of_three_channels(see):
+    gray = rand(2)[:, :1].clone()
+    image = see(gray)
+    assert image.shape == gray.shape
+    with EyeFilter("myopia", CAMERA, SETTINGS) as eye_filter:
+        for own, found in zip(gray, image, strict=True):
+            seen = eye_filter.filter(
+                np.repeat(own.permute(1, 2, 0).numpy(), 3, axis=2),
+                DEPTH_M,
+                **STATE,
+                output="linear",
+                merge=False,
+                bright_pixels=False,
+                whole=True,
+            )
+            wanted = seen.color @ np.array([0.2126, 0.7152, 0.0722], np.float32)
+            np.testing.assert_allclose(found[0].numpy(), wanted, rtol=2e-6, atol=1e-6)
+    assert torch.equal(see(gray[0]), image[0])
+    assert torch.equal(see(gray[0, 0]), image[0, 0])
+    found = see.A_dagger(image, max_iter=100, tol=1e-7)
+    assert (see(found) - image).norm() < 0.02 * image.norm()
+
+
+def test_gradients_of_gray_images_by_focus(see):
+    """Of the luminance of three channels that are the same."""
+    own, slopes = copy.deepcopy(see), []
+    weights = torch.tensor([0.2126, 0.7152, 0.0722])[:, None, None]
+    own.profile = "emmetropia"  # the other does not accommodate at these distances
+    gray = rand()[:1]
+    for color, weighed in ((gray, 1.0), (gray.expand(3, HEIGHT, WIDTH), weights)):
+        own.focus_dpt = torch.tensor(3.2, requires_grad=True)
+        image = (own(color) * weighed).sum(dim=0)
+        image.square().sum().backward()
+        slopes.append(own.focus_dpt.grad)
+    torch.testing.assert_close(*slopes, rtol=1e-4, atol=0.0)
+    assert abs(slopes[0]) > 0.1
+    own.close()
 
 
 @pytest.mark.parametrize("method", ["A", "A_adjoint"])
@@ -177,6 +323,30 @@ class Pictures(Dataset):
         return torch.stack([image.detach(), color.grad])
 
 
+class Process(Dataset):
+    """Threads of a process, and whether another one estimates its eyes."""
+
+    def __len__(self):
+        return 2
+
+    def __getitem__(self, index):
+        with EyeFilter(engine="native") as eye_filter:
+            has_process = eye_filter.builder.worker.has_process
+        return torch.tensor([thread_count(), has_process])
+
+
+@pytest.mark.parametrize(
+    ("method", "variable", "count"),
+    [("fork", "", 1), ("spawn", "", 1), ("fork", "2", 2)],
+)
+def test_workers_use_one_thread_and_no_other_process(
+    monkeypatch, method, variable, count
+):
+    monkeypatch.setenv("OCUFILTER_THREADS", variable)
+    loader = DataLoader(Process(), num_workers=1, multiprocessing_context=method)
+    assert torch.cat(list(loader)).tolist() == [[count, False]] * 2
+
+
 @pytest.mark.parametrize("method", ["fork", "spawn"])
 def test_workers_return_the_same(see, method):
     pictures = Pictures(see, rand(4))
@@ -197,14 +367,14 @@ def test_other_shapes_and_types_raise(see):
 def test_gradients_by_pupil_and_focus(see):
     """Of a batch, against differences of the filter's images."""
     own = copy.deepcopy(see)
-    own.render_tolerance = 0.0
+    own.profile, own.render_tolerance = "emmetropia", 0.0
     own.focus_dpt = torch.nn.Parameter(torch.tensor(3.2))
     own.pupil_diameter_mm = torch.tensor(4.0, requires_grad=True)
     assert [name for name, _ in own.named_parameters()] == ["focus_dpt"]
     color = rand(2)
     own(color).square().sum().backward()
     exact = copy.deepcopy(see)
-    exact.render_tolerance = 0.0
+    exact.profile, exact.render_tolerance = "emmetropia", 0.0
 
     def loss(**state):
         for name, value in {
@@ -220,6 +390,7 @@ def test_gradients_by_pupil_and_focus(see):
         high, low = (loss(**{name: value + k * step}) for k in (1, -1))
         slope = float(getattr(own, name).grad)
         assert slope == pytest.approx((high - low) / (2.0 * step), rel=0.05)
+        assert abs(slope) > 0.1
     own.focus_dpt.grad = None
     own.pupil_diameter_mm = 4.0
     color.requires_grad_()
