@@ -21,6 +21,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from estimator.color import lms_weights, xyz_weights
 from estimator.color.observers import AGES_YEARS, STANDARD_AGE_YEARS, Observer
+from estimator.native import shared_threads
+from estimator.native.records import pointer_to
 from filter_service.camera import Camera
 from filter_service.constants import RGB
 from filter_service.displays import LIMITS_NM, Triple, display_wavelengths_nm
@@ -28,6 +30,7 @@ from filter_service.errors import BadMessage
 from filter_service.filtering.eye_filter import EyeFilter
 from filter_service.filtering.planned_frame import Filtered
 from filter_service.given_profile import Profile, as_profile
+from filter_service.native import loops
 from filter_service.rgbd_view import RgbdView, as_cameras
 from filter_service.settings import (
     DEFAULTS,
@@ -257,33 +260,66 @@ class BandFilter:
         _check_bands("bands", bands, self.wavelengths_nm.size)
         if hidden_bands is not None:
             _check_bands("hidden_bands", hidden_bands, self.wavelengths_nm.size)
-        seen = np.empty(bands.shape, np.float32)
+        colors = self._split(bands)
+        hidden = None if hidden_bands is None else self._split(hidden_bands)
         found = []
-        for group, eye_filter in zip(self._groups, self._filters, strict=True):
-            view = RgbdView(
-                group.of(bands),
-                depth_m,
-                self.camera.tangents,
-                depth_kind,
-                hidden_color=None if hidden_bands is None else group.of(hidden_bands),
-                hidden_depth_m=hidden_depth_m,
-            )
-            frame = eye_filter.filter(
-                view,
-                pupil_diameter_mm=pupil_diameter_mm,
-                focus_dpt=focus_dpt,
-                gaze_deg=gaze_deg,
-                output="linear",
-                whole=True,
-                timeout_s=timeout_s,
-                **options,
-            )
-            for band, channel in zip(group.bands, group.channels, strict=True):
-                seen[..., band] = frame.color[..., channel]
-            found.append(frame)
+        with self._filters[0].builder.as_one_frame():
+            for number, eye_filter in enumerate(self._filters):
+                view = RgbdView(
+                    colors[number],
+                    depth_m,
+                    self.camera.tangents,
+                    depth_kind,
+                    hidden_color=None if hidden is None else hidden[number],
+                    hidden_depth_m=hidden_depth_m,
+                )
+                frame = eye_filter.filter(
+                    view,
+                    pupil_diameter_mm=pupil_diameter_mm,
+                    focus_dpt=focus_dpt,
+                    gaze_deg=gaze_deg,
+                    output="linear",
+                    whole=True,
+                    timeout_s=timeout_s,
+                    **options,
+                )
+                found.append(frame)
         return FilteredBands(
-            seen, self.wavelengths_nm, tuple(found), self._lens_age_years
+            self._joined([frame.color for frame in found]),
+            self.wavelengths_nm,
+            tuple(found),
+            self._lens_age_years,
         )
+
+    def _split(self, bands: NDArray[Any]) -> NDArray[np.float32]:
+        """Return the colors (groups, height, width, 3) of an image's bands."""
+        height, width, count = bands.shape
+        band_of = np.array([group.band_of_channel for group in self._groups], np.int64)
+        found = np.empty((len(band_of), height, width, RGB), np.float32)
+        image = np.ascontiguousarray(bands, np.float32)
+        loops().call(
+            "split_bands",
+            *(shared_threads(), image, height * width, count),
+            *(band_of, len(band_of), found),
+        )
+        return found
+
+    def _joined(self, colors: Sequence[NDArray[Any]]) -> NDArray[np.float32]:
+        """Return the bands (height, width, n) of the colors of all groups."""
+        height, width, _ = colors[0].shape
+        found = np.empty((height, width, self.wavelengths_nm.size), np.float32)
+        place_of = np.empty(found.shape[2], np.int64)
+        for number, group in enumerate(self._groups):
+            for band, channel in zip(group.bands, group.channels, strict=True):
+                place_of[band] = RGB * number + channel
+        contiguous = [np.ascontiguousarray(color, np.float32) for color in colors]
+        frames = np.array([pointer_to(color) for color in contiguous], np.int64)
+        loops().call(
+            "join_bands",
+            *(shared_threads(), frames, place_of),
+            *(height * width, found.shape[2], found),
+        )
+        return found
 
 
 @dataclass(frozen=True)
@@ -309,15 +345,13 @@ class BandGroup:
         """Return the setting ``display`` of these wavelengths."""
         return ",".join(repr(nm) for nm in self.wavelengths_nm)
 
-    def of(self, image: NDArray[Any]) -> NDArray[Any]:
-        """Return the color (height, width, 3) of this group's bands of an image."""
-        bands = [self.bands[0]] * RGB
+    @property
+    def band_of_channel(self) -> list[int]:
+        """Return the band of each channel."""
+        found = [self.bands[0]] * RGB
         for band, channel in zip(self.bands, self.channels, strict=True):
-            bands[channel] = band
-        color = np.empty((*image.shape[:2], RGB), image.dtype)
-        for channel, band in enumerate(bands):  # faster than image[..., bands]
-            color[..., channel] = image[..., band]
-        return color
+            found[channel] = band
+        return found
 
 
 def band_groups(

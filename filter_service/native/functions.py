@@ -20,6 +20,8 @@ FUNCTIONS = {
     "add_scattered": "pool f4[] i8 i8 f4[] i8 i8 f8[] f8[] f8 f8[]",
     "resample": "pool f4[] f4[] i8 i8 f8[] f8[] f4[] f4[]",
     "resample_adjoint": "f4[] i8 i8 f8[] f8[] f4[]",
+    "split_bands": "pool f4[] i8 i8 i8[] i8 f4[]",
+    "join_bands": "pool i8[] i8[] i8 i8 f4[]",
     "needed_intervals": "record",
     "spread_nodes": "f8[] f8[] f8[] i8[] f8[] i8 i8 -> int",
     "node_blur": "f8[] f8[] f8[] i8[] f8[] f8[] f4[] i8 i8 i8",

@@ -5,10 +5,13 @@ import pytest
 
 from estimator.color import lms_weights
 from estimator.media import channel_gains
+from estimator.native import shared_threads
+from estimator.native.records import pointer_to
 from filter_service.camera import Camera
 from filter_service.errors import BadMessage
 from filter_service.filtering import BandFilter, EyeFilter
 from filter_service.filtering.band_filter import band_groups
+from filter_service.native import loops
 from filter_service.settings import DEFAULTS
 
 CAMERA = Camera.from_fov(6.0, width_px=48, height_px=32)
@@ -105,6 +108,51 @@ def test_hidden_bands_are_seen_past_a_near_edge():
             **STATE,
         )
     assert (seen.bands - without.bands).max() > 0.5
+
+
+def test_bands_are_copied_to_frames_and_back():
+    """Two items of work, and a group with one band."""
+    rng = np.random.default_rng(5)
+    n_pixels, n_bands = 3000, 7
+    image = rng.random((n_pixels, n_bands), np.float32)
+    band_of = np.array([[6, 0, 3], [1, 5, 2], [4, 4, 4]])
+    frames = np.empty((3, n_pixels, 3), np.float32)
+    call, threads = loops().call, shared_threads()
+    call("split_bands", threads, image, n_pixels, n_bands, band_of, 3, frames)
+    assert np.array_equal(frames, np.moveaxis(image[:, band_of], 1, 0))
+    addresses = np.array([pointer_to(frame) for frame in frames])
+    place_of = np.array([1, 3, 5, 2, 8, 4, 0])
+    back = np.empty_like(image)
+    call("join_bands", threads, addresses, place_of, n_pixels, n_bands, back)
+    assert np.array_equal(back, image)
+
+
+@pytest.mark.long("builds eyes")
+def test_half_floats_are_filtered_like_the_same_values_in_float32():
+    bands, depth_m = scene(4)
+    halves = bands.astype(np.float16)
+    nm = [450.0, 500.0, 550.0, 600.0]
+    with BandFilter(
+        MYOPIA, CAMERA, SETTINGS, wavelengths_nm=nm, engine="native"
+    ) as band_filter:
+        seen = band_filter.filter(halves, depth_m, **STATE)
+        expected = band_filter.filter(halves.astype(np.float32), depth_m, **STATE)
+    assert np.array_equal(seen.bands, expected.bands)
+
+
+def test_the_thread_waits_for_the_end_of_an_image(monkeypatch):
+    """After each frame it would look for predicted PSFs of all groups."""
+    with EyeFilter(engine="native") as eye_filter:
+        builder, woken = eye_filter.builder, []
+        monkeypatch.setattr(builder._wake, "set", lambda: woken.append(True))
+        with pytest.raises(RuntimeError), builder.as_one_frame():
+            for _ in range(3):
+                builder.end_frame(eye_filter._eyes, 0.001)
+            assert not woken
+            raise RuntimeError
+        assert len(woken) == 1
+        builder.end_frame(eye_filter._eyes, 0.001)
+        assert len(woken) == 2
 
 
 def test_the_order_of_bands_does_not_matter():

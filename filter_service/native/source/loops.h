@@ -24,6 +24,7 @@
 #include "kernel_plan.h"
 #include "haze.h"
 #include "spectacles.h"
+#include "bands.h"
 #include "defocus_nodes.h"
 #include "layers.h"
 #include "bright_pixels.h"
@@ -100,6 +101,8 @@ static const named_function functions[] = {
     FUNCTION(add_scattered),
     FUNCTION(resample),
     FUNCTION(resample_adjoint),
+    FUNCTION(split_bands),
+    FUNCTION(join_bands),
     FUNCTION(needed_intervals),
     FUNCTION(spread_nodes),
     FUNCTION(node_blur),
