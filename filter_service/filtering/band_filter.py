@@ -21,8 +21,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from estimator.color import lms_weights, xyz_weights
 from estimator.color.observers import AGES_YEARS, STANDARD_AGE_YEARS, Observer
-from estimator.native import shared_threads
-from estimator.native.records import pointer_to
 from filter_service.camera import Camera
 from filter_service.constants import RGB
 from filter_service.displays import LIMITS_NM, Triple, display_wavelengths_nm
@@ -30,7 +28,7 @@ from filter_service.errors import BadMessage
 from filter_service.filtering.eye_filter import EyeFilter
 from filter_service.filtering.planned_frame import Filtered
 from filter_service.given_profile import Profile, as_profile
-from filter_service.native import loops
+from filter_service.rendering.band_copies import joined_bands, split_bands
 from filter_service.rgbd_view import RgbdView, as_cameras
 from filter_service.settings import (
     DEFAULTS,
@@ -186,6 +184,10 @@ class BandFilter:
         self._lens_age_years = _lens_age_years(age_years)
         eye = replace(eye, yellowing=None)
         self._groups = band_groups(self.wavelengths_nm, self.settings)
+        self._places = np.empty((self.wavelengths_nm.size, 2), np.int64)
+        for number, group in enumerate(self._groups):
+            self._places[list(group.bands), 0] = number
+            self._places[list(group.bands), 1] = group.channels
         with ExitStack() as closing:
             self._filters = tuple(
                 closing.enter_context(
@@ -260,8 +262,9 @@ class BandFilter:
         _check_bands("bands", bands, self.wavelengths_nm.size)
         if hidden_bands is not None:
             _check_bands("hidden_bands", hidden_bands, self.wavelengths_nm.size)
-        colors = self._split(bands)
-        hidden = None if hidden_bands is None else self._split(hidden_bands)
+        band_of = np.array([group.band_of_channel for group in self._groups])
+        colors = split_bands(bands, band_of)
+        hidden = None if hidden_bands is None else split_bands(hidden_bands, band_of)
         found = []
         with self._filters[0].builder.as_one_frame():
             for number, eye_filter in enumerate(self._filters):
@@ -285,41 +288,11 @@ class BandFilter:
                 )
                 found.append(frame)
         return FilteredBands(
-            self._joined([frame.color for frame in found]),
+            joined_bands([frame.color for frame in found], self._places),
             self.wavelengths_nm,
             tuple(found),
             self._lens_age_years,
         )
-
-    def _split(self, bands: NDArray[Any]) -> NDArray[np.float32]:
-        """Return the colors (groups, height, width, 3) of an image's bands."""
-        height, width, count = bands.shape
-        band_of = np.array([group.band_of_channel for group in self._groups], np.int64)
-        found = np.empty((len(band_of), height, width, RGB), np.float32)
-        image = np.ascontiguousarray(bands, np.float32)
-        loops().call(
-            "split_bands",
-            *(shared_threads(), image, height * width, count),
-            *(band_of, len(band_of), found),
-        )
-        return found
-
-    def _joined(self, colors: Sequence[NDArray[Any]]) -> NDArray[np.float32]:
-        """Return the bands (height, width, n) of the colors of all groups."""
-        height, width, _ = colors[0].shape
-        found = np.empty((height, width, self.wavelengths_nm.size), np.float32)
-        place_of = np.empty(found.shape[2], np.int64)
-        for number, group in enumerate(self._groups):
-            for band, channel in zip(group.bands, group.channels, strict=True):
-                place_of[band] = RGB * number + channel
-        contiguous = [np.ascontiguousarray(color, np.float32) for color in colors]
-        frames = np.array([pointer_to(color) for color in contiguous], np.int64)
-        loops().call(
-            "join_bands",
-            *(shared_threads(), frames, place_of),
-            *(height * width, found.shape[2], found),
-        )
-        return found
 
 
 @dataclass(frozen=True)

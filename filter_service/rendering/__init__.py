@@ -28,6 +28,7 @@ frame            preparation of a view: missing depth, edges, merging
 image_cells      cells of the image that share kernels, and their maps
 frame_states     stores of engines, with layers and cells of the last frame
 frame_kernels    plan of a frame's kernels, and the PSFs that it needs
+band_copies      copies of images of many bands to frames of three, and back
 media_effects    effects of ocular media and spectacles; straylight
 edge_kinds       bright pixels, and the edges that send their light
 edge_light       light of bright pixels beyond their kernels

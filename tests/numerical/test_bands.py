@@ -5,13 +5,11 @@ import pytest
 
 from estimator.color import lms_weights
 from estimator.media import channel_gains
-from estimator.native import shared_threads
-from estimator.native.records import pointer_to
 from filter_service.camera import Camera
 from filter_service.errors import BadMessage
 from filter_service.filtering import BandFilter, EyeFilter
 from filter_service.filtering.band_filter import band_groups
-from filter_service.native import loops
+from filter_service.rendering.band_copies import joined_bands, split_bands
 from filter_service.settings import DEFAULTS
 
 CAMERA = Camera.from_fov(6.0, width_px=48, height_px=32)
@@ -112,19 +110,12 @@ def test_hidden_bands_are_seen_past_a_near_edge():
 
 def test_bands_are_copied_to_frames_and_back():
     """Two items of work, and a group with one band."""
-    rng = np.random.default_rng(5)
-    n_pixels, n_bands = 3000, 7
-    image = rng.random((n_pixels, n_bands), np.float32)
+    image = np.random.default_rng(5).random((50, 60, 7), np.float32)
     band_of = np.array([[6, 0, 3], [1, 5, 2], [4, 4, 4]])
-    frames = np.empty((3, n_pixels, 3), np.float32)
-    call, threads = loops().call, shared_threads()
-    call("split_bands", threads, image, n_pixels, n_bands, band_of, 3, frames)
-    assert np.array_equal(frames, np.moveaxis(image[:, band_of], 1, 0))
-    addresses = np.array([pointer_to(frame) for frame in frames])
-    place_of = np.array([1, 3, 5, 2, 8, 4, 0])
-    back = np.empty_like(image)
-    call("join_bands", threads, addresses, place_of, n_pixels, n_bands, back)
-    assert np.array_equal(back, image)
+    frames = split_bands(image, band_of)
+    assert np.array_equal(frames, np.moveaxis(image[..., band_of], 2, 0))
+    places = np.array([[0, 1], [1, 0], [1, 2], [0, 2], [2, 1], [1, 1], [0, 0]])
+    assert np.array_equal(joined_bands(list(frames), places), image)
 
 
 @pytest.mark.long("builds eyes")
