@@ -6,8 +6,8 @@ import os
 import re
 import secrets
 import stat
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 PART_NAME = re.compile(r"\.ocufilter-[0-9a-f]{32}\.part(\.\w+)?")
@@ -48,24 +48,71 @@ def replace_atomically(
         If the file exists, and `is_new` is set.
     OSError
     """
-    mode = _PRIVATE if is_private else 0o666
     if not is_private:
         with suppress(FileNotFoundError):
             found = path.stat().st_mode
             if stat.S_ISCHR(found) or stat.S_ISFIFO(found):
                 write(path)
                 return
-            mode &= stat.S_IMODE(found) | _PRIVATE
+    mode = _PRIVATE if is_private else _mode_of(path)
+    with _written_part(path, write, mode) as part:
+        if is_new:
+            os.link(part, path)  # unlike a rename, this never replaces a file
+        else:
+            os.replace(part, path)
+
+
+def replace_with_header(
+    header: Path,
+    write_header: Callable[[Path], object],
+    data: Path,
+    write_data: Callable[[Path], object],
+) -> None:
+    """Write a file of data and its header under other names, then rename both.
+
+    The header is renamed last, and an earlier one is removed before the data are
+    renamed: at no time does a header stand beside data that it does not describe.  If
+    writing fails, earlier files remain.
+
+    Parameters
+    ----------
+    header, data : Path
+    write_header, write_data : callable
+        As for `replace_atomically`.
+
+    Raises
+    ------
+    OSError
+    """
+    with (
+        _written_part(data, write_data, _mode_of(data)) as data_part,
+        _written_part(header, write_header, _mode_of(header)) as header_part,
+    ):
+        header.unlink(missing_ok=True)
+        os.replace(data_part, data)
+        os.replace(header_part, header)
+
+
+def _mode_of(path: Path) -> int:
+    """Return the permissions of an earlier file, or those of a new one."""
+    mode = 0o666
+    with suppress(FileNotFoundError):
+        mode &= stat.S_IMODE(path.stat().st_mode) | _PRIVATE
+    return mode
+
+
+@contextmanager
+def _written_part(
+    path: Path, write: Callable[[Path], object], mode: int
+) -> Iterator[Path]:
+    """Write a temporary file in the folder of a path; remove it at the end."""
     part = path.with_name(f".ocufilter-{secrets.token_hex(16)}.part{path.suffix}")
     os.close(os.open(part, _NEW_FILE, mode))
     try:
         write(part)
         with part.open("rb") as file:
             os.fsync(file.fileno())  # before the rename, even in a power failure
-        if is_new:
-            os.link(part, path)  # unlike a rename, this never replaces a file
-        else:
-            os.replace(part, path)
+        yield part
     finally:
         with suppress(FileNotFoundError):
             part.unlink()

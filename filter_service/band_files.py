@@ -10,6 +10,7 @@ import math
 import re
 import struct
 import zlib
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.bounded_files import InvalidFile, read_bytes, read_text, reason_of
+from filter_service.atomic_files import replace_atomically, replace_with_header
 from filter_service.bounded_images import MAX_DECODED_BYTES
 from filter_service.image_files import read_npy
 
@@ -113,16 +115,16 @@ def write_bands(
 ) -> None:
     """Write an image (height, width, n) as ``.npy``, or as ENVI with a ``.dat`` file.
 
+    Files appear complete or not at all; see `replace_with_header`.
+
     Raises
     ------
     OSError
     """
     if path.suffix.lower() == ".npy":
-        with path.open("wb") as file:
-            np.save(file, bands, allow_pickle=False)
+        replace_atomically(path, partial(_save_npy, bands))
         return
     lines, samples, count = bands.shape
-    path.with_suffix(".dat").write_bytes(np.asarray(bands, "<f4").tobytes())
     header = [
         "ENVI",
         f"samples = {samples}",
@@ -136,7 +138,18 @@ def write_bands(
     if wavelengths_nm is not None:
         listed = ", ".join(f"{nm:.9g}" for nm in wavelengths_nm.tolist())
         header += ["wavelength units = Nanometers", f"wavelength = {{{listed}}}"]
-    path.write_text("\n".join(header) + "\n", encoding="utf-8")
+    text = "\n".join(header) + "\n"
+    replace_with_header(
+        path,
+        lambda part: part.write_text(text, encoding="utf-8"),
+        path.with_suffix(".dat"),
+        lambda part: np.ascontiguousarray(bands, "<f4").tofile(part),
+    )
+
+
+def _save_npy(bands: NDArray[np.float32], path: Path) -> None:
+    with path.open("wb") as file:  # given a path, NumPy may add a suffix
+        np.save(file, bands, allow_pickle=False)
 
 
 def _read_envi(path: Path, option: str) -> BandImage:

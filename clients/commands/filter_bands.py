@@ -2,7 +2,6 @@
 
 import re
 import time
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -119,7 +118,6 @@ def filter_bands(
         check_range("--lens-age-years", lens_age_years, AGE_LIMITS_YEARS)
 
     from estimator.profiles.files import load_profile
-    from filter_service.atomic_files import replace_atomically
     from filter_service.band_files import BAND_OUTPUT_SUFFIXES, read_bands, write_bands
     from filter_service.camera import Camera, PixelGrid
     from filter_service.filtering.band_filter import BandFilter
@@ -156,11 +154,7 @@ def filter_bands(
         )
     found_image = _as_output(seen, output, lens_age_years, field_size_deg)
     of_bands = nm if output == "bands" else None
-    write = partial(write_bands, bands=found_image, wavelengths_nm=of_bands)
-    if out.suffix.lower() == ".npy":
-        replace_atomically(out, write)
-    else:
-        write(out)  # two files
+    write_bands(out, found_image, wavelengths_nm=of_bands)
     summary = {
         "out": str(out),
         "width_px": width_px,

@@ -1,5 +1,8 @@
 """Files of images of many wavelengths: layouts, limits and damage."""
 
+import errno
+import os
+
 import numpy as np
 import pytest
 from scipy import io
@@ -20,6 +23,35 @@ def test_what_is_written_is_read(tmp_path, suffix):
     assert np.array_equal(found.bands, BANDS)
     if suffix == ".hdr":
         assert np.array_equal(found.wavelengths_nm, NM)
+
+
+def test_an_envi_header_never_describes_other_data(tmp_path, monkeypatch):
+    path = tmp_path / "a.hdr"
+    write_bands(path, BANDS)
+    more, rename, seen = np.ones((5, 7, 6), np.float32), os.replace, []
+
+    def replace_and_read(source, target):
+        rename(source, target)
+        seen.append(read_bands(path).bands.shape if path.exists() else None)
+
+    monkeypatch.setattr(os, "replace", replace_and_read)
+    write_bands(path, more)
+    assert seen == [None, more.shape]
+
+
+@pytest.mark.parametrize("suffix", [".hdr", ".npy"])
+def test_a_full_disk_keeps_the_earlier_files(tmp_path, monkeypatch, suffix):
+    path = tmp_path / f"a{suffix}"
+    write_bands(path, BANDS)
+    before = {file.name: file.read_bytes() for file in tmp_path.iterdir()}
+
+    def fail(_descriptor):
+        raise OSError(errno.ENOSPC, "no space left")
+
+    monkeypatch.setattr(os, "fsync", fail)
+    with pytest.raises(OSError, match="no space left"):
+        write_bands(path, np.ones((5, 7, 6), np.float32))
+    assert {file.name: file.read_bytes() for file in tmp_path.iterdir()} == before
 
 
 @pytest.mark.parametrize(
