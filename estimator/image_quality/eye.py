@@ -23,7 +23,6 @@ from estimator.image_quality.pupil_light import (
     finest_psfs,
     lens_of,
     mapped,
-    mean_modulation,
     psf_batches,
 )
 from estimator.image_quality.states import (
@@ -346,7 +345,7 @@ class Eye:
             found = light.untilted.transfer(
                 white_light=white_light, stiles_crawford=apodization
             )
-            return mean_modulation(found, np.atleast_1d(cpd)).reshape(cpd.shape)
+            return found.modulation(cpd).reshape(cpd.shape)
 
         values, notes = mapped(modulation, lights, cpd.shape, notes)
         if straylight:
@@ -488,7 +487,7 @@ class Eye:
                 transfer = light.untilted.transfer(
                     white_light=False, stiles_crawford=None
                 )
-                found["modulation_ratio"] = mean_modulation(transfer, cpd[None]).item()
+                found["modulation_ratio"] = transfer.modulation(cpd).item()
             return np.array([found[quantity] for quantity in quantities])
 
         values, notes = mapped(quality, moved, (len(quantities),), notes)

@@ -46,9 +46,6 @@ MAX_PSF_RADIUS_PX = 1023
 MAX_THREADS = 8
 """Transfer functions take up to 0.5 GB per thread."""
 
-N_ORIENTATIONS = 90
-"""Orientations over which a mean is taken; the other half of the circle is equal."""
-
 
 @dataclass(frozen=True)
 class PupilLight:
@@ -201,17 +198,6 @@ def encircled_ratio(
         disc = radius_deg * j1(2.0 * np.pi * radius_deg * cpd) / cpd
         found.append(step_cpd**2 * (np.pi * radius_deg**2 + float(disc @ sums)))
     return np.array(found)
-
-
-def mean_modulation(
-    transfer: Transfer, frequency_cpd: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Return the modulation (n,) at frequencies (n,), mean over all orientations."""
-    angles = np.pi * (np.arange(N_ORIENTATIONS) + 0.5) / N_ORIENTATIONS
-    x_cpd, y_cpd = (
-        frequency_cpd[:, None] * along for along in (np.cos(angles), np.sin(angles))
-    )
-    return np.abs(transfer.at(x_cpd, y_cpd)).mean(axis=-1)
 
 
 def psf_batches(
