@@ -29,6 +29,11 @@ CORNEA_DPT = 43.04
 AQUEOUS_INDEX = 1.3386
 """Values of the schematic eye of Escudero-Sanz and Navarro (1999) at 555 nm."""
 
+CORNEA_INDEX, TEAR_INDEX = 1.376, 1.336
+TEAR_FILM_RATIO = (CORNEA_INDEX - TEAR_INDEX) / (CORNEA_INDEX - 1.0)
+"""Share of the wavefront of the anterior cornea that remains behind a rigid lens, whose
+tear film fills its irregularities."""
+
 TYPICAL_DEPTH_MM = 4.6
 """Depth of an implanted lens behind the cornea; 4 to 5 mm are usual."""
 
@@ -82,7 +87,7 @@ class WornLens(rx.Prescription):
     replaces_lens : bool
         Whether the lens replaces the crystalline lens and its accommodation.
     design : str
-        Design name of an intraocular lens.
+        Design name of an intraocular lens, or ``rigid`` for a rigid contact lens.
     depth_mm : float
         Depth of an intraocular lens behind the cornea.  Its powers here are those in
         the pupil.

@@ -28,6 +28,9 @@ MAX_ZONES = 12
 OPTIC_MM = 6.0
 """Largest diameter of rings and zones."""
 
+CONTACT_OPTIC_MM = 12.0
+"""Largest diameter of zones on a contact lens."""
+
 CORNEA_SPHERICAL_ABERRATION_UM = 0.27
 """C(4,0) on 6 mm of the mean cornea (Holladay et al., J. Refract. Surg. 18, 2002)."""
 
@@ -131,12 +134,40 @@ Decentration = Annotated[
 ]
 
 
+ZoneAddDpt = Annotated[float, Meta(ge=-5.0, le=6.0)]
+ZoneAddsDpt = Annotated[
+    tuple[ZoneAddDpt, ...],
+    Meta(min_length=1, max_length=MAX_ZONES, description="additions of the zones"),
+]
+ContactZoneDiameterMm = Annotated[float, Meta(ge=0.5, le=CONTACT_OPTIC_MM)]
+
+
 class ContactLensBody(PowersBody, kw_only=True, tag_field="kind", tag="contact_lens"):
     """A contact lens."""
 
     rotation_deg: RotationDeg = 0.0
     spherical_aberration_um: SphericalAberrationUm = 0.0
     decentration_mm: Decentration = (0.0, 0.0)
+    rigid: Annotated[
+        bool,
+        Meta(
+            description="a rigid lens: its tear film leaves 11 % of the astigmatism and "
+            "higher orders of a measured eye; `sphere_dpt` includes the tear film"
+        ),
+    ] = False
+    zone_adds_dpt: ZoneAddsDpt | UnsetType = UNSET
+    zone_diameters_mm: (
+        Annotated[
+            tuple[ContactZoneDiameterMm, ...],
+            Meta(
+                min_length=1,
+                max_length=MAX_ZONES,
+                description="as many outer diameters, ascending; required with "
+                "`zone_adds_dpt`",
+            ),
+        ]
+        | UnsetType
+    ) = UNSET
 
 
 class IntraocularBody(Body, kw_only=True):
@@ -248,17 +279,13 @@ class ExtendedDepthBody(
     ] = 1.5
 
 
-ZoneAddDpt = Annotated[float, Meta(ge=-5.0, le=6.0)]
 ZoneDiameterMm = Annotated[float, Meta(ge=0.5, le=OPTIC_MM)]
 
 
 class ZonesBody(IntraocularBody, kw_only=True, tag_field="kind", tag="iol/zones"):
     """A refractive lens with concentric zones."""
 
-    zone_adds_dpt: Annotated[
-        tuple[ZoneAddDpt, ...],
-        Meta(min_length=1, max_length=MAX_ZONES, description="additions of the zones"),
-    ]
+    zone_adds_dpt: ZoneAddsDpt
     zone_diameters_mm: Annotated[
         tuple[ZoneDiameterMm, ...],
         Meta(

@@ -18,6 +18,7 @@ from estimator.corrections.rings import (
     Rings,
 )
 from estimator.corrections.worn_lens import (
+    TEAR_FILM_RATIO,
     WornLens,
     diameter_at_pupil_mm,
     power_at_pupil_dpt,
@@ -27,9 +28,11 @@ from estimator.eye.parameters import RetinaShape
 from estimator.media import CATARACTS, DEFAULT_AGE_YEARS, Straylight
 from estimator.note import Note, note_of
 from estimator.optics import prescription as rx
+from estimator.optics.units import MM_PER_M
 from estimator.optics.vergence import TYPICAL_ENTRANCE_PUPIL_MM
 from estimator.profiles import bodies
 from estimator.profiles.bodies import (
+    CONTACT_OPTIC_MM,
     CORNEA_SPHERICAL_ABERRATION_UM,
     OPTIC_MM,
     BifocalBody,
@@ -60,6 +63,13 @@ LEAST_VERTEX_MM = 5.0
 """Spectacles are farther away; less may be in meters or centimeters."""
 
 SHOWN_DPT = 0.005
+
+RIGID_NOTE = Note(
+    "rigid_lens",
+    "rigid contact lens: astigmatism and higher orders are attributed to the anterior "
+    f"cornea, and the tear film leaves {100.0 * TEAR_FILM_RATIO:.0f} % of them",
+    remaining_ratio=TEAR_FILM_RATIO,
+)
 
 MAX_DENOMINATOR, RATIO_TOLERANCE = 4, 0.03
 PATH = "correction."
@@ -96,7 +106,11 @@ def parse_correction(
         case LensletsBody():
             return _lenslets(body)
         case ContactLensBody():
-            return WornLens(**_lens_at_the_eye(body, "contact_lens"))
+            return WornLens(
+                **_lens_at_the_eye(body, "contact_lens"),
+                rings=_contact_zones(body),
+                design="rigid" if body.rigid else "",
+            )
     return _intraocular(body, has_cornea=has_cornea)
 
 
@@ -328,19 +342,9 @@ def _light(body: BifocalBody | TrifocalBody, steps: str) -> tuple[float, ...] | 
 
 
 def _zones(body: ZonesBody) -> RefractiveZones:
-    diameters_mm = list(body.zone_diameters_mm)
-    if len(diameters_mm) != len(body.zone_adds_dpt):
-        raise ProfileError(
-            PATH + "zone_diameters_mm",
-            f"{_written(diameters_mm)} has another length than zone_adds_dpt",
-            f"a list of {len(body.zone_adds_dpt)} numbers from 0.5 to {OPTIC_MM:g}",
-        )
-    if diameters_mm != sorted(set(diameters_mm)):
-        raise ProfileError(
-            PATH + "zone_diameters_mm",
-            f"{_written(diameters_mm)} is not ascending",
-            "outer diameters, ascending",
-        )
+    diameters_mm = _checked_diameters_mm(
+        body.zone_adds_dpt, body.zone_diameters_mm, largest_mm=OPTIC_MM
+    )
     depth_mm = body.depth_mm
     return RefractiveZones(
         outer_mm=tuple(
@@ -351,6 +355,48 @@ def _zones(body: ZonesBody) -> RefractiveZones:
         ),
         centre_mm=body.decentration_mm,
     )
+
+
+def _contact_zones(body: ContactLensBody) -> RefractiveZones | None:
+    """Return the zones of a multifocal contact lens in the entrance pupil, or None."""
+    if body.zone_adds_dpt is UNSET and body.zone_diameters_mm is UNSET:
+        return None
+    adds_dpt = () if body.zone_adds_dpt is UNSET else body.zone_adds_dpt
+    given_mm = () if body.zone_diameters_mm is UNSET else body.zone_diameters_mm
+    diameters_mm = _checked_diameters_mm(
+        adds_dpt, given_mm, largest_mm=CONTACT_OPTIC_MM
+    )
+    # As for any lens in front of the pupil: light converges or diverges on its way.
+    before_m = TYPICAL_ENTRANCE_PUPIL_MM / MM_PER_M
+    far_dpt = body.sphere_dpt + body.cylinder_dpt / 2.0
+    wider = 1.0 - before_m * far_dpt
+    return RefractiveZones(
+        outer_mm=tuple(d * wider / 2.0 for d in diameters_mm),
+        powers_dpt=tuple(
+            (far_dpt + add_dpt) / (1.0 - before_m * (far_dpt + add_dpt))
+            - far_dpt / wider
+            for add_dpt in adds_dpt
+        ),
+        centre_mm=body.decentration_mm,
+    )
+
+
+def _checked_diameters_mm(
+    adds_dpt: Sequence[float], diameters_mm: Sequence[float], *, largest_mm: float
+) -> list[float]:
+    if len(diameters_mm) != len(adds_dpt):
+        raise ProfileError(
+            PATH + "zone_diameters_mm",
+            f"{_written(diameters_mm)} has another length than zone_adds_dpt",
+            f"a list of {len(adds_dpt)} numbers from 0.5 to {largest_mm:g}",
+        )
+    if list(diameters_mm) != sorted(set(diameters_mm)):
+        raise ProfileError(
+            PATH + "zone_diameters_mm",
+            f"{_written(diameters_mm)} is not ascending",
+            "outer diameters, ascending",
+        )
+    return list(diameters_mm)
 
 
 def _written(values: Sequence[float]) -> str:
@@ -380,6 +426,15 @@ def common_fields(body: bodies.CommonBody, kind: str) -> dict[str, Any]:
         raise ProfileError(
             "correction", "is required with spectacle_magnification", "an object"
         )
+    notes: tuple[Note, ...] = ()
+    if isinstance(body.correction, ContactLensBody) and body.correction.rigid:
+        if not isinstance(body, bodies.WavefrontBody):
+            raise ProfileError(
+                PATH + "rigid",
+                f"applies to measured eyes, and this one is given by its {kind}",
+                "false, or the surfaces of the lens as parts of the eye",
+            )
+        notes = (RIGID_NOTE,)
     retina = None
     if isinstance(body.retina, bodies.RetinaBody):
         retina = RetinaShape(
@@ -405,6 +460,7 @@ def common_fields(body: bodies.CommonBody, kind: str) -> dict[str, Any]:
                 body if isinstance(body, bodies.PrescriptionBody) else None,
                 body.correction,
             ),
+            *notes,
         ),
     }
 

@@ -13,7 +13,7 @@ from typing import Any, cast
 import msgspec
 import numpy as np
 
-from estimator.corrections.worn_lens import replaces_lens
+from estimator.corrections.worn_lens import TEAR_FILM_RATIO, replaces_lens
 from estimator.eye.checked_fields import ProfileError
 from estimator.eye.parameters import PARAMETER_NAMES, EyeParameters
 from estimator.note import Note
@@ -195,9 +195,10 @@ def _prescription(body: bodies.PrescriptionBody) -> EyeProfile:
     return EyeProfile(
         kind="prescription",
         **_primary(
+            body.correction,
             Measurement(
                 zernike_um, 2.0 * PRESCRIPTION_RADIUS_MM, REFERENCE_WAVELENGTH_NM
-            )
+            ),
         ),
         max_pupil_diameter_mm=math.inf,
         add_dpt=body.add_dpt,
@@ -222,7 +223,25 @@ def _higher_order(
     return body.higher_order
 
 
-def _primary(first: Measurement, *others: Measurement) -> dict[str, Any]:
+def _behind_tear_film(
+    measurement: Measurement, correction: bodies.CorrectionBody | None
+) -> Measurement:
+    """Return a measurement behind the tear film of a rigid lens, if one is worn.
+
+    All terms but C(2,0), which the power of the lens corrects, are smaller; tilt as
+    well, so that the slope at the center stays zero.
+    """
+    if not (isinstance(correction, bodies.ContactLensBody) and correction.rigid):
+        return measurement
+    zernike_um = measurement.zernike_um * TEAR_FILM_RATIO
+    zernike_um[rx.C20] = measurement.zernike_um[rx.C20]
+    return replace(measurement, zernike_um=zernike_um)
+
+
+def _primary(
+    correction: bodies.CorrectionBody | None, *given: Measurement
+) -> dict[str, Any]:
+    first, *others = (_behind_tear_film(m, correction) for m in given)
     radius_mm = first.pupil_diameter_mm / 2.0
     at_cornea_um = polynomial_in_mm(remove_central_tilt(first.zernike_um), radius_mm)
     depth_mm = TYPICAL_ENTRANCE_PUPIL_MM
@@ -246,7 +265,9 @@ def _zernike(body: bodies.ZernikeBody) -> EyeProfile:
     common["notes"] += order_notes(body, body.frame, zernike_um, pupil_mm)
     return EyeProfile(
         kind="zernike",
-        **_primary(Measurement(zernike_um, pupil_mm, body.wavelength_nm)),
+        **_primary(
+            body.correction, Measurement(zernike_um, pupil_mm, body.wavelength_nm)
+        ),
         max_pupil_diameter_mm=pupil_mm,
         **common,
     )
@@ -281,7 +302,7 @@ def _zernike_set(body: bodies.ZernikeSetBody) -> EyeProfile:
     common["notes"] = (*common["notes"], *notes, *repeats)
     return EyeProfile(
         kind="zernike_set",
-        **_primary(first, *others),
+        **_primary(body.correction, first, *others),
         max_pupil_diameter_mm=first.pupil_diameter_mm,
         **common,
     )

@@ -5,13 +5,18 @@ import pytest
 
 from estimator.corrections.progressive import ProgressiveLens
 from estimator.corrections.rings import DiffractiveRings, RefractiveZones
-from estimator.optics.prescription import Prescription, power_vector
+from estimator.optics.prescription import (
+    Prescription,
+    power_vector,
+    power_vectors_dpt,
+)
 from estimator.profiles.measured_wavefront import MeasuredWavefront
 from estimator.profiles.parse import ProfileError, parse_profile
 
 IOL = {"kind": "iol"}
 TRIFOCAL = IOL | {"design": "trifocal", "adds_dpt": [1.66, 3.33]}
 ZONES = IOL | {"design": "zones"}
+SOFT = {"kind": "contact_lens", "sphere_dpt": -3}
 
 
 def wearing(correction, **more):
@@ -71,6 +76,38 @@ def test_designs_have_the_rings_that_they_name():
     zones = ZONES | {"zone_adds_dpt": [2, 0], "zone_diameters_mm": [1.5, 6]}
     assert isinstance(wearing(zones).correction.rings, RefractiveZones)
     assert wearing(IOL).correction.rings is None
+
+
+def test_zones_of_a_contact_lens_act_as_its_powers_do():
+    adds_dpt, diameters_mm = [0.0, 2.0, 0.0], [3.36, 4.78, 6.75]
+    zones = {"zone_adds_dpt": adds_dpt, "zone_diameters_mm": diameters_mm}
+    bare = {"kind": "contact_lens", "sphere_dpt": -8.0}
+    rings = wearing(bare | zones).correction.rings
+    added_dpt = -6 / 1.0183 + 8 / 1.0244  # F / (1 - L F) with and without the addition
+    assert rings.powers_dpt == pytest.approx([0.0, added_dpt, 0.0])
+    # light that a lens of -8 dpt spreads is wider in the pupil, 3.05 mm behind it
+    assert rings.outer_mm == pytest.approx(np.array(diameters_mm) / 2 * 1.0244)
+
+
+def test_a_tear_film_leaves_the_sphere_and_a_ninth_of_the_rest():
+    body = {"kind": "preset", "name": "keratoconus"}
+    lens = {"kind": "contact_lens", "sphere_dpt": -2.5}
+    soft = parse_profile(body | {"correction": lens})
+    rigid = parse_profile(body | {"correction": lens | {"rigid": True}})
+    left = np.full(28, 0.04 / 0.376)  # indices of cornea, tears and air
+    left[4] = 1.0
+    assert rigid.zernike_um == pytest.approx(soft.zernike_um * left)
+    assert rigid.correction.sphere_dpt == soft.correction.sphere_dpt
+    assert [note.code for note in rigid.notes if note not in soft.notes] == [
+        "rigid_lens"
+    ]
+    toric = wearing(lens | {"rigid": True}, cylinder_dpt=-2.0, axis_deg=30)
+    m_dpt, *astigmatism_dpt = power_vectors_dpt(toric.zernike_um, 3.0)
+    assert m_dpt == pytest.approx(-1.0)
+    assert 2.0 * np.hypot(*astigmatism_dpt) == pytest.approx(2.0 * 0.04 / 0.376)
+    eye = {"kind": "published", "name": "arizona"}
+    with pytest.raises(ProfileError, match="given by its published"):
+        parse_profile(eye | {"correction": lens | {"rigid": True}})
 
 
 def test_a_progressive_lens_is_what_the_gaze_goes_through():
@@ -143,6 +180,12 @@ def test_lenslets_have_the_room_that_their_number_leaves():
         (
             ZONES | {"zone_adds_dpt": [0, 2], "zone_diameters_mm": [3, 2]},
             "correction.zone_diameters_mm",
+        ),
+        (SOFT | {"zone_adds_dpt": [0, 2]}, "correction.zone_diameters_mm"),
+        (SOFT | {"zone_diameters_mm": [3]}, "correction.zone_diameters_mm"),
+        (
+            SOFT | {"zone_adds_dpt": [0, 2], "zone_diameters_mm": [3, 13]},
+            "correction.zone_diameters_mm.1",
         ),
         ({"kind": "progressive", "sphere_dpt": 0}, "correction.add_dpt"),
         (
