@@ -19,7 +19,8 @@ The package imports its modules only when their names are used.
     pyrender_stream  streaming of a scene through a running service
     pyrender_renderer  frames of pyrender scenes, and of files that trimesh loads
     demo             `ocufilter demo`: two scenes through six eyes
-    scenes/          two scenes, a letter chart, and their rendering
+    scenes/          scenes, a letter chart, and their rendering
+    scenarios        two states of one person in a scene, such as before and after surgery
     report/          `ocufilter report`
     commands/        command line `ocufilter`
     web/             `ocufilter web`: a page in a browser
