@@ -13,6 +13,12 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from clients.scenes.letter_chart import LOG_MAR_ROWS, ROWS_OF_LETTERS, letter_chart
+from filter_service import Camera, RgbdView
+
+CHART_HEIGHT_DEG = 4.6
+CHART_LARGEST_LOG_MAR = 0.7
+
 CHART = "chart"
 """Scene of the letter chart, which is at the distance that the person looks at."""
 
@@ -100,3 +106,49 @@ def _scenario(name: str, body: dict[str, Any]) -> Scenario:
     }
     gaze_deg = tuple(body.pop("gaze_deg", (0.0, 0.0)))
     return Scenario(name=name, gaze_deg=gaze_deg, **states, **body)
+
+
+def scenario_view(scenario: Scenario, size_px: tuple[int, int]) -> RgbdView:
+    """Render the scene of a scenario, with its hidden layer.
+
+    Colors are sRGB bytes, or linear light in a scene with lamps brighter than white.
+
+    Parameters
+    ----------
+    scenario : Scenario
+    size_px : (int, int)
+        Width and height of the image.
+
+    Raises
+    ------
+    ValueError
+        If the size is too small for the chart.
+    RenderFailed
+        If this machine offers no OpenGL context for the scene.
+    """
+    if scenario.scene == CHART:
+        width_px, height_px = size_px
+        camera = Camera.from_fov(
+            CHART_HEIGHT_DEG, width_px=width_px, height_px=height_px
+        )
+        rows = [row for row in LOG_MAR_ROWS if row <= CHART_LARGEST_LOG_MAR]
+        chart = letter_chart(
+            camera,
+            distance_m=scenario.distance_m,
+            log_mar=rows,
+            letters=ROWS_OF_LETTERS[-len(rows) :],
+        )
+        return chart.view
+    from clients.scene_renderer import PATHS, SceneRenderer, path_moments
+    from clients.scenes.catalog import build_scene
+
+    scene = build_scene(scenario.scene)
+    (moment,) = path_moments(PATHS[scenario.scene], 1)
+    with SceneRenderer(scene, size_px, is_linear=scene.is_hdr) as renderer:
+        visible, hidden = renderer.render_layers(moment.pose)
+        return RgbdView(
+            *visible,
+            renderer.tangents,
+            hidden_color=hidden[0],
+            hidden_depth_m=hidden[1],
+        )

@@ -106,6 +106,8 @@ class SceneRenderer:
         Width and height of an image.
     supersampling : int
         Samples per pixel along each axis; see `SceneView`.
+    is_linear : bool
+        Whether colors are linear light in float32, which may exceed 1.
 
     Raises
     ------
@@ -116,12 +118,21 @@ class SceneRenderer:
     """
 
     def __init__(
-        self, scene: Scene, size_px: tuple[int, int], *, supersampling: int = 3
+        self,
+        scene: Scene,
+        size_px: tuple[int, int],
+        *,
+        supersampling: int = 3,
+        is_linear: bool = False,
     ):
         self._context = open_context()
         try:
             self._view = SceneView(
-                self._context, scene, size_px, supersampling=supersampling
+                self._context,
+                scene,
+                size_px,
+                supersampling=supersampling,
+                is_linear=is_linear,
             )
         except BaseException:
             self._context.release()
@@ -271,6 +282,16 @@ PATHS = {
         Key((0.0, 0.03, 0.01), (-0.05, 0.0, -1.0), 4.0, 0.39),
         Key((-0.03, 0.01, 0.0), (-0.02, 0.02, -1.0), 3.0, 0.25),
         Key((-0.01, 0.0, 0.0), (0.0, 0.0, -1.0), 4.0, 4.17),
+    ),
+    "night_road": (
+        Key((0.0, 1.2, 0.0), (-0.8, 1.0, -30.0), 5.6, 40.0),
+        Key((0.02, 1.2, -0.04), (-0.4, 1.0, -30.0), 5.0, 20.0),
+        Key((0.0, 1.21, -0.08), (0.2, 0.9, -30.0), 4.5, 0.8),
+    ),
+    "stairs": (
+        Key((0.0, 0.0, 0.0), (0.0, -0.84, -1.0), 3.1, 2.5),
+        Key((0.03, -0.01, -0.05), (0.05, -0.74, -1.05), 3.6, 4.0),
+        Key((0.0, 0.0, -0.02), (0.0, -0.94, -1.0), 4.2, 0.6),
     ),
 }
 

@@ -3,7 +3,8 @@
 // from the nearest to the farthest.  Rows are flipped, so that the image is read back with its top row first.
 // The program defines SAMPLES per axis and the constants in capitals.  With LEAST_GAP_DPT
 // defined, the samples are those of the hidden layer; only samples at least that far behind
-// the visible surface count, and the depth is 0 where the pixel has none.
+// the visible surface count, and the depth is 0 where the pixel has none.  With LINEAR
+// defined, samples and pixels hold linear light.
 
 #define COUNT (SAMPLES * SAMPLES)
 
@@ -65,7 +66,10 @@ void main()
         sum += texelFetch(samples_light, place, 0).rgb;
         count++;
     }
-    srgb = vec4(srgb_from_linear(sum / float(max(count, 1))), 1.0);
+    srgb = vec4(sum / float(max(count, 1)), 1.0);
+#ifndef LINEAR
+    srgb.rgb = srgb_from_linear(srgb.rgb);
+#endif
     float picked = ranked(per_m, count / 4);
 #ifdef LEAST_GAP_DPT
     // A surface behind a sliver of a nearer one is visible in this pixel already.

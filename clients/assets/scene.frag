@@ -2,7 +2,8 @@
 // Flat shading: the light is baked into the vertices.  It is multiplied by the texture in
 // sRGB values.  With LEAST_GAP_DPT defined, the shader renders the hidden layer: it discards
 // fragments that are less than that behind the visible surface, and back faces that are less
-// than twice as far away, because these are the far side of the visible object.
+// than twice as far away, because these are the far side of the visible object.  With LINEAR
+// defined, it writes linear light, which may exceed 1.
 
 uniform sampler2D surface;
 #ifdef LEAST_GAP_DPT
@@ -25,5 +26,12 @@ void main()
     if (is_far_side || seen - per_m < LEAST_GAP_DPT) discard;
 #endif
     vec3 product = vertex_srgb * texture(surface, vertex_uv).rgb;
+#ifdef LINEAR
+    product = max(product, 0.0);
+    vec3 curve = pow((product + (SRGB_GAIN - 1.0)) / SRGB_GAIN, vec3(SRGB_POWER));
+    bvec3 is_dark = lessThanEqual(product, vec3(SRGB_SLOPE * SRGB_KNEE));
+    srgb = vec4(mix(curve, product / SRGB_SLOPE, is_dark), 1.0);
+#else
     srgb = vec4(clamp(product, 0.0, 1.0), 1.0);
+#endif
 }

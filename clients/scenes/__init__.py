@@ -1,1 +1,1 @@
-"""Two test scenes and a letter chart, built without files, and their rendering."""
+"""Four scenes and a letter chart, built without files, and their rendering."""

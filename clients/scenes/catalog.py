@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from clients.scenes import courtyard
+from clients.scenes import courtyard, night_road, stairs
 from clients.scenes.appearance import checks, optotype_e, squares, uint8_srgb
 from clients.scenes.geometry import (
     Array,
@@ -121,6 +121,8 @@ def _light(normals: Array) -> Array:
 SCENE_BUILDERS: dict[str, Callable[[], Scene]] = {
     "primitives": build_primitives,
     "courtyard": courtyard.build,
+    "night_road": night_road.build,
+    "stairs": stairs.build,
 }
 """Builder function of each scene."""
 

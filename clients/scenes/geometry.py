@@ -316,6 +316,9 @@ class Scene:
         Planar depth from which a surface counts as background, at infinity.
     fov_deg : float
         Vertical field of view.
+    is_hdr : bool
+        Whether lamps are brighter than white (`luminous`); only linear images show
+        them.
     """
 
     name: str
@@ -325,6 +328,7 @@ class Scene:
     far_m: float
     infinite_from_m: float
     fov_deg: float = 50.0
+    is_hdr: bool = False
 
     @property
     def n_triangles(self) -> int:
@@ -346,6 +350,19 @@ def finished(mesh: Mesh, light: Array, textures: dict[str, NDArray[np.uint8]]) -
         srgb=srgb.astype(np.float32),
         texture=textures[mesh.texture] if mesh.texture else None,
     )
+
+
+def luminous(mesh: Mesh) -> Batch:
+    """Convert a mesh without texture to a draw call of its emission.
+
+    Light above 1 continues the sRGB curve, which linear images undo.
+    """
+    light = np.maximum(mesh.emission, 0.0)
+    srgb = np.where(
+        light <= 1.0, srgb_from_linear(light), 1.055 * light ** (1 / 2.4) - 0.055
+    )
+    unlit = finished(mesh, np.zeros_like(mesh.emission), {})
+    return replace(unlit, srgb=srgb.astype(np.float32))
 
 
 def _wound(mesh: Mesh) -> NDArray[np.int64]:

@@ -16,11 +16,12 @@ import moderngl
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
-from clients.scenes.geometry import Array, Scene
+from clients.scenes.geometry import Array, Scene, linear_from_srgb
 from filter_service.errors import RenderFailed
 
 Tangents = tuple[float, float, float, float]
-Picture = tuple[NDArray[np.uint8], NDArray[np.float32]]
+Picture = tuple[NDArray[Any], NDArray[np.float32]]
+"""Color, sRGB bytes or linear floats, and depth."""
 
 _FRAMEBUFFER_SRGB = 0x8DB9  # GL_FRAMEBUFFER_SRGB
 _WRITE, _KEEP = (True,) * 4, (False,) * 4
@@ -33,9 +34,10 @@ _Made = TypeVar("_Made")
 _ASSETS = Path(__file__).resolve().parents[1] / "assets"
 _SRGB8_ALPHA8 = 0x8C43  # GL_SRGB8_ALPHA8
 
-_RESOLVE_CONSTANTS = {
-    # Bits of the float: a division by zero need not give infinity.
-    "INFINITY_BITS": "0x7F800000u",
+_INFINITY_BITS = "0x7F800000u"
+"""Bits of the float: a division by zero need not give infinity."""
+
+_SRGB_CONSTANTS: dict[str, object] = {
     # IEC 61966-2-1, as in `clients.scenes.geometry`.
     "SRGB_GAIN": 1.055,
     "SRGB_POWER": 2.4,
@@ -77,7 +79,7 @@ class SceneImage:
     Attributes
     ----------
     color : moderngl.Texture
-        RGBA8 with sRGB values.
+        RGBA8 with sRGB values, or RGBA32F with linear light.
     depth_m : moderngl.Texture
         Planar depth, R32F; +inf for the background.
     """
@@ -143,6 +145,9 @@ class SceneView:
         Samples per pixel along each axis.
     image_count : int
         Number of images that `draw` can keep at a time.
+    is_linear : bool
+        Whether colors are linear light in float32, which may exceed 1, instead of sRGB
+        bytes.
 
     Raises
     ------
@@ -169,8 +174,9 @@ class SceneView:
         *,
         supersampling: int = 2,
         image_count: int = 1,
+        is_linear: bool = False,
     ):
-        self.scene, self.size_px = scene, size_px
+        self.scene, self.size_px, self.is_linear = scene, size_px, is_linear
         self._context, self._supersampling = context, supersampling
         self._owned: list[Any] = []
         try:
@@ -216,8 +222,8 @@ class SceneView:
 
         Returns
         -------
-        color : (h, w, 3) uint8
-            sRGB, top row first.
+        color : (h, w, 3) uint8 or float32
+            sRGB, or linear light if the view is linear; top row first.
         depth_m : (h, w) float32
             Planar depth; +inf for the background and from `scene.infinite_from_m` on.
 
@@ -329,7 +335,7 @@ class SceneView:
             # enabled the conversion.
             self._context.disable_direct(_FRAMEBUFFER_SRGB)
             samples.color_mask = cast("Any", (_WRITE, _KEEP))
-            samples.clear(*self.scene.background_srgb, 1.0)
+            samples.clear(*self._background, 1.0)
             samples.color_mask = cast("Any", (_KEEP, _WRITE))
             samples.clear()
             samples.color_mask = cast("Any", (_WRITE, _WRITE))
@@ -345,10 +351,17 @@ class SceneView:
         """Resolve samples to pixels and return these; waits for the GPU."""
         pixels, (width, height) = self._images[0], self.size_px
         self._resolve_to(pixels, layer, seen)
-        color = np.empty((height, width, 3), np.uint8)
+        dtype = np.float32 if self.is_linear else np.uint8
+        color = np.empty((height, width, 3), dtype)
         depth_m = np.empty((height, width), np.float32)
         # The size of a row of three-byte pixels need not be a multiple of four.
-        pixels.read_into(color, components=3, attachment=0, alignment=1)
+        pixels.read_into(
+            color,
+            components=3,
+            attachment=0,
+            alignment=1,
+            dtype="f4" if self.is_linear else "f1",
+        )
         pixels.read_into(depth_m, components=1, attachment=1, dtype="f4")
         return color, depth_m
 
@@ -361,6 +374,12 @@ class SceneView:
                 if texture is not None:
                     cast("moderngl.Texture", texture).use(unit)
             layer.resolving.render(moderngl.TRIANGLES, vertices=3)
+
+    @property
+    def _background(self) -> tuple[float, ...]:
+        if not self.is_linear:
+            return self.scene.background_srgb
+        return tuple(linear_from_srgb(np.array(self.scene.background_srgb)).tolist())
 
     @cached_property
     def _hidden(self) -> Layer:
@@ -378,13 +397,16 @@ class SceneView:
         # Samples hold sRGB values, which OpenGL decodes to linear light on reading:
         # faster than a power law in the shader.
         samples = self._target(samples_px, _SRGB8_ALPHA8, with_depth=True)
-        program: Any = self._program("scene.vert", "scene.frag", defines)
+        constants = {**_SRGB_CONSTANTS, **defines}
+        if self.is_linear:
+            constants["LINEAR"] = 1
+        program: Any = self._program("scene.vert", "scene.frag", constants)
         program["surface"].value = 0
         calls = [
             (self._own(self._context.vertex_array(program, *content)), texture)
             for content, texture in self._content
         ]
-        constants = {"SAMPLES": self._supersampling, **_RESOLVE_CONSTANTS, **defines}
+        constants |= {"SAMPLES": self._supersampling, "INFINITY_BITS": _INFINITY_BITS}
         resolving: Any = self._program("resolve.vert", "resolve.frag", constants)
         resolving["samples_light"].value, resolving["samples_per_m"].value = 0, 1
         resolving["infinite_to_per_m"].value = 1.0 / self.scene.infinite_from_m
@@ -399,7 +421,10 @@ class SceneView:
     ) -> moderngl.Framebuffer:
         """Return a framebuffer for a color and a float."""
         context, own = self._context, self._own
-        color = own(context.texture(size_px, 4, internal_format=color_format))
+        if self.is_linear:
+            color = own(context.texture(size_px, 4, dtype="f4"))
+        else:
+            color = own(context.texture(size_px, 4, internal_format=color_format))
         values = own(context.texture(size_px, 1, dtype="f4"))
         for texture in (color, values):
             texture.filter = (moderngl.NEAREST, moderngl.NEAREST)
