@@ -20,7 +20,7 @@ The package imports its modules only when their names are used.
     pyrender_renderer  frames of pyrender scenes, and of files that trimesh loads
     demo             `ocufilter demo`: two scenes through six eyes
     scenes/          scenes, a letter chart, and their rendering
-    scenarios        two states of one person in a scene, such as before and after surgery
+    scenarios        two states of one person in a scene, such as with two lenses
     report/          `ocufilter report`
     commands/        command line `ocufilter`
     web/             `ocufilter web`: a page in a browser

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from clients.scenes.letter_chart import LOG_MAR_ROWS, ROWS_OF_LETTERS, letter_chart
-from filter_service import Camera, RgbdView
+from filter_service import Camera, EyeFilter, Filtered, Output, RgbdView
 
 CHART_HEIGHT_DEG = 4.6
 CHART_LARGEST_LOG_MAR = 0.7
@@ -55,8 +55,8 @@ class Scenario:
         What the model leaves out, in one sentence.
     scene : str
         Name of a scene of `clients.scenes.catalog`, or `CHART`.
-    luminance_cd_m2 : float
-        Luminance to which the eye is adapted.
+    luminance_nit : float
+        Luminance to which the eye is adapted, cd/m².
     pupil_diameter_mm : float
         Pupil at this luminance and age (Watson and Yellott, J. Vision 12(10):12, 2012).
     distance_m : float
@@ -72,7 +72,7 @@ class Scenario:
     sees: str
     leaves_out: str
     scene: str
-    luminance_cd_m2: float
+    luminance_nit: float
     pupil_diameter_mm: float
     distance_m: float
     gaze_deg: tuple[float, float]
@@ -96,6 +96,20 @@ def scenarios() -> Mapping[str, Scenario]:
     """Return all scenarios by their names."""
     text = Path(__file__).with_suffix(".json").read_text(encoding="utf-8")
     return {name: _scenario(name, body) for name, body in json.loads(text).items()}
+
+
+def scenario_named(name: str) -> Scenario:
+    """Return a scenario by its name.
+
+    Raises
+    ------
+    ValueError
+        If no scenario has that name.
+    """
+    if name not in scenarios():
+        names = ", ".join(sorted(scenarios()))
+        raise ValueError(f"unknown scenario {name!r:.60}; expected one of: {names}")
+    return scenarios()[name]
 
 
 def _scenario(name: str, body: dict[str, Any]) -> Scenario:
@@ -152,3 +166,35 @@ def scenario_view(scenario: Scenario, size_px: tuple[int, int]) -> RgbdView:
             hidden_color=hidden[0],
             hidden_depth_m=hidden[1],
         )
+
+
+def filtered_states(
+    scenario: Scenario, view: RgbdView, *, output: Output = "srgb8", **settings: Any
+) -> tuple[Filtered, Filtered]:
+    """Filter a view through both states of a scenario.
+
+    Parameters
+    ----------
+    scenario : Scenario
+    view : RgbdView
+        Its scene, such as of `scenario_view`.
+    output : "srgb8", "linear" or "linear16"
+    **settings
+        Settings of the filter.
+    """
+    found = []
+    for state in (scenario.a, scenario.b):
+        with EyeFilter(
+            dict(state.profile), view.camera, settings, worker=False
+        ) as eye_filter:
+            found.append(
+                eye_filter.filter(
+                    view,
+                    pupil_diameter_mm=scenario.pupil_diameter_mm,
+                    focus_dpt=scenario.focus_dpt,
+                    gaze_deg=scenario.gaze_deg,
+                    output=output,
+                    whole=True,
+                )
+            )
+    return found[0], found[1]

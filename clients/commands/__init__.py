@@ -7,6 +7,7 @@ filter_image   filter: one image
 filter_bands   bands: one image of many wavelengths
 correct_image  correct: a picture solved for a viewer
 best_lens      best-lens: spectacles or a contact lens for a scene
+scenario       scenario: two states of one person
 eye            estimate and field: an eye and its visual field
 optics         wavefront and psf: an eye in one direction
 coefficients   coefficients in other orders, as wavefront and estimate print them

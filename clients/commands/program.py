@@ -65,6 +65,10 @@ COMMANDS = {
         "clients.stimuli.program:stimuli",
         "Draw stimuli of exact size; filter them through eyes.",
     ),
+    "scenario": (
+        "clients.commands.scenario:scenario",
+        "Show what a person sees before and after, or with two lenses.",
+    ),
     "estimate": (
         "clients.commands.eye:estimate",
         "Estimate the eye that reproduces a measured wavefront.",

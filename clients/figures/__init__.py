@@ -11,6 +11,7 @@ style      sizes, colors, fonts
 wavefront  maps of a wavefront, orders, coefficients, point images, section of the eye
 curves     contrast, acuity and refraction by frequency, distance and direction, and
            curves of persons drawn from the population
+defocus    maps of defocus over the field, with zones and lenslets
 """
 
 import lazy_loader

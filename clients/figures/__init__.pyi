@@ -10,6 +10,9 @@ from .curves import field_maps_figure as field_maps_figure
 from .curves import modulation as modulation
 from .curves import mtf_figure as mtf_figure
 from .curves import through_focus_acuity_figure as through_focus_acuity_figure
+from .defocus import added_power_dpt as added_power_dpt
+from .defocus import defocus_maps_figure as defocus_maps_figure
+from .defocus import field_defocus_dpt as field_defocus_dpt
 from .study import AcuityByDistance as AcuityByDistance
 from .study import EyeStudy as EyeStudy
 from .study import PupilWavefront as PupilWavefront

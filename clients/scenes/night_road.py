@@ -78,10 +78,7 @@ def build() -> Scene:
         ),
     }
     lit = [*_ground(), *_verges(), *_signs(), *_cars(), *_posts(), *_person()]
-    batches = [
-        finished(mesh, _light(mesh), textures)
-        for mesh in by_texture(lit)
-    ]
+    batches = [finished(mesh, _light(mesh), textures) for mesh in by_texture(lit)]
     batches.append(luminous(merged([*_lamps(), *_windows()])))
     return Scene(
         name="night_road",
@@ -322,7 +319,9 @@ def _lamps() -> list[Mesh]:
             (x - side_m, y - 0.12, z + 0.1), (2 * side_m, 0, 0), (0, side_m / 2, 0)
         )
         # What is seen from the road, far below the lamp's main direction.
-        found.append(_emitting(glass, "#ffd9a0", 0.4 * _STREET_LAMP_CD / _STREET_LAMP_M2))
+        found.append(
+            _emitting(glass, "#ffd9a0", 0.4 * _STREET_LAMP_CD / _STREET_LAMP_M2)
+        )
     return found
 
 
@@ -355,7 +354,9 @@ def _speed_sign() -> Array:
     y, x = np.mgrid[0:256, 0:256] / 127.5 - 1.0
     radius = np.hypot(x, y)
     image = np.where(
-        ((radius > 0.74) & (radius < 0.97))[..., None], linear_from_hex("#c01818"), image
+        ((radius > 0.74) & (radius < 0.97))[..., None],
+        linear_from_hex("#c01818"),
+        image,
     )
     return np.where((radius >= 0.97)[..., None], linear_from_hex("#303438"), image)
 

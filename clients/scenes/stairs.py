@@ -1,4 +1,4 @@
-"""Stairs: a flight that leads down from the viewer's feet, at distances of 1.6 to 6 m."""
+"""Stairs: a flight that leads down from the viewer's feet, 1.6 to 6 m away."""
 
 import numpy as np
 

@@ -151,8 +151,8 @@ class ContactLensBody(PowersBody, kw_only=True, tag_field="kind", tag="contact_l
     rigid: Annotated[
         bool,
         Meta(
-            description="a rigid lens: its tear film leaves 11 % of the astigmatism and "
-            "higher orders of a measured eye; `sphere_dpt` includes the tear film"
+            description="a rigid lens: its tear film leaves 11 % of the astigmatism "
+            "and higher orders of a measured eye; `sphere_dpt` includes the tear film"
         ),
     ] = False
     zone_adds_dpt: ZoneAddsDpt | UnsetType = UNSET
