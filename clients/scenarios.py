@@ -113,13 +113,15 @@ def scenario_named(name: str) -> Scenario:
 
 
 def _scenario(name: str, body: dict[str, Any]) -> Scenario:
-    person = body.pop("person")
-    states = {
-        side: ScenarioState(state["title"], {**person, **state["entries"]})
-        for side, state in ((side, body.pop(side)) for side in ("a", "b"))
-    }
-    gaze_deg = tuple(body.pop("gaze_deg", (0.0, 0.0)))
-    return Scenario(name=name, gaze_deg=gaze_deg, **states, **body)
+    person, a, b = (body.pop(part) for part in ("person", "a", "b"))
+    h_deg, v_deg = body.pop("gaze_deg", (0.0, 0.0))
+    return Scenario(
+        name=name,
+        gaze_deg=(h_deg, v_deg),
+        a=ScenarioState(a["title"], {**person, **a["entries"]}),
+        b=ScenarioState(b["title"], {**person, **b["entries"]}),
+        **body,
+    )
 
 
 def scenario_view(scenario: Scenario, size_px: tuple[int, int]) -> RgbdView:

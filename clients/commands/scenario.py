@@ -119,10 +119,9 @@ def _write(
         view = scenario_view(chosen, size_px)
         progress.task("Filtering")
         seen = filtered_states(chosen, view)
-    scene = view.color
-    if scene.dtype != "uint8":
-        scene = uint8_srgb(scene)
-    images: dict[str, tuple[Any, dict[str, str] | None]] = {"scene.png": (scene, None)}
+    is_hdr = view.color.dtype != "uint8"
+    scene = uint8_srgb(view.color.astype(float)) if is_hdr else view.color
+    images: dict[str, tuple[Any, dict[str, str]]] = {"scene.png": (scene, {})}
     for side, state, filtered in zip(
         ("a", "b"), (chosen.a, chosen.b), seen, strict=True
     ):

@@ -58,7 +58,7 @@ ends."""
 
 _STREET_LAMP_CD, _STREET_LAMP_M2 = 700.0, 0.06
 _STREET_LAMPS_M = tuple((3.4, 7.0, -z) for z in (30.0, 65.0, 100.0, 135.0, 170.0))
-_SKY = "#0b1020"
+_SKY_SRGB = (0.043, 0.063, 0.125)
 _LENGTH_M = 260.0
 
 
@@ -83,7 +83,7 @@ def build() -> Scene:
     return Scene(
         name="night_road",
         batches=tuple(batches),
-        background_srgb=tuple(int(_SKY[k : k + 2], 16) / 255 for k in (1, 3, 5)),
+        background_srgb=_SKY_SRGB,
         near_m=0.5,
         far_m=600.0,
         infinite_from_m=400.0,

@@ -376,10 +376,11 @@ class SceneView:
             layer.resolving.render(moderngl.TRIANGLES, vertices=3)
 
     @property
-    def _background(self) -> tuple[float, ...]:
+    def _background(self) -> tuple[float, float, float]:
         if not self.is_linear:
             return self.scene.background_srgb
-        return tuple(linear_from_srgb(np.array(self.scene.background_srgb)).tolist())
+        red, green, blue = linear_from_srgb(np.array(self.scene.background_srgb))
+        return float(red), float(green), float(blue)
 
     @cached_property
     def _hidden(self) -> Layer:

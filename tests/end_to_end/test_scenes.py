@@ -1,4 +1,4 @@
-"""The two test scenes: where things are, how frames look, that light is baked right."""
+"""The scenes: where things are, how frames look, that light is baked right."""
 
 import ctypes
 from dataclasses import replace
@@ -9,8 +9,15 @@ from scipy.ndimage import binary_erosion
 
 from clients.scene_renderer import PATHS, SceneRenderer, look_at, path_moments
 from clients.scenes.appearance import Baker, Lights
+from clients.scenes import night_road, stairs
 from clients.scenes.catalog import build_scene
-from clients.scenes.geometry import box, patch, placed, sphere
+from clients.scenes.geometry import (
+    box,
+    patch,
+    placed,
+    sphere,
+    srgb_from_linear,
+)
 from clients.scenes.scene_view import LEAST_GAP_DPT, open_context
 from filter_service.errors import RenderFailed
 
@@ -255,3 +262,64 @@ def test_unknown_scene_is_refused_with_the_known_ones():
 def test_empty_picture_is_refused(primitives):
     with pytest.raises(ValueError, match="0x90"):
         SceneRenderer(primitives, (0, 90))
+
+
+def test_linear_images_hold_the_light_of_the_bytes(primitives):
+    with SceneRenderer(primitives, (160, 90)) as renderer:
+        encoded, depth_m = renderer.render(np.eye(4))
+    with SceneRenderer(primitives, (160, 90), is_linear=True) as renderer:
+        light, linear_m = renderer.render(np.eye(4))
+    assert light.dtype == np.float32
+    assert np.array_equal(depth_m, linear_m)
+    # Samples are rounded to bytes, which weighs more in the dark part of a mixed pixel,
+    # and their mean is rounded once more.
+    difference = np.abs(255.0 * srgb_from_linear(light) - encoded)
+    assert difference.max() < 1.5
+    assert difference.mean() < 0.35
+
+
+def test_lamps_light_the_eye_as_their_intensity_tells():
+    """Illuminance of the headlamps of each oncoming car: twice intensity over d²."""
+    scene = night_road.build()
+    near = np.eye(4)
+    near[:3, 3] = 0.0, night_road.EYE_HEIGHT_M, 0.0
+    with SceneRenderer(scene, (960, 540), is_linear=True) as renderer:
+        light, _ = renderer.render(near)
+    left, right, up, down = renderer.tangents
+    x = left + (right - left) * (np.arange(960) + 0.5) / 960
+    y = up + (down - up) * (np.arange(540) + 0.5) / 540
+    pixel_sr = (right - left) * (up - down) / light[..., 0].size
+    luminance = night_road.WHITE_CD_M2 * light @ (0.2126, 0.7152, 0.0722)
+    height = night_road.LAMP_HEIGHT_M - night_road.EYE_HEIGHT_M
+    for distance_m in night_road.CAR_DISTANCES_M[:1]:
+        at_x = night_road.ONCOMING_X_M / distance_m
+        wide = (night_road.HALF_TRACK_M + 0.2) / distance_m
+        columns = np.abs(x - at_x) < wide
+        rows = np.abs(y - height / distance_m) < 0.2 / distance_m
+        lamps = luminance[np.ix_(rows, columns)]
+        lux = lamps[lamps > 100.0].sum() * pixel_sr
+        expected = 2.0 * night_road.LOW_BEAM_CD / distance_m**2
+        assert lux == pytest.approx(expected, rel=0.1)  # few samples across a lamp
+    assert luminance.max() > 10_000.0
+    assert 0.2 < np.median(luminance[y < -0.1]) < 3.0  # a lit road
+
+
+@pytest.mark.clients
+def test_edges_of_the_stairs_are_where_they_are_said_to_be():
+    scene = build_scene("stairs")
+    pose = look_at((0, 0, 0), (0, -0.84, -1.0))
+    with SceneRenderer(scene, (128, 512), supersampling=1) as renderer:
+        color, depth_m = renderer.render(pose)
+    assert np.isfinite(depth_m).all()
+    assert ((color > 250).all(-1)).mean() < 0.05
+    _, _, up, down = renderer.tangents
+    middle_m = depth_m[:, 64]
+    for step in range(4, 10):
+        y, z = stairs.edge_m(step)
+        depth = -np.array([0.0, y, z]) @ pose[:3, 2]
+        tangent = np.array([0.0, y, z]) @ pose[:3, 1] / depth
+        row = (up - tangent) / (up - down) * 512
+        # A tread ends here, and the step beyond it is farther away.
+        before, after = middle_m[round(row) + 2], middle_m[round(row) - 3]
+        assert before == pytest.approx(depth, abs=0.03)
+        assert after > depth + 0.04
