@@ -36,7 +36,7 @@ ENDLESS = ("serve", "web", "layer serve", "layer run", "headset --left")
 
 SLOW = (
     *("doctor", "report", "batch", "latency", "best-lens", "headset --simulated"),
-    *(r"field .* --people", r"stimuli .* -p "),
+    *(r"field .* --people", r"stimuli .* -p ", "scenario .* -o"),
 )
 """Commands, as patterns, that take seconds."""
 

@@ -8,8 +8,8 @@ import pytest
 from scipy.ndimage import binary_erosion
 
 from clients.scene_renderer import PATHS, SceneRenderer, look_at, path_moments
-from clients.scenes.appearance import Baker, Lights
 from clients.scenes import night_road, stairs
+from clients.scenes.appearance import Baker, Lights
 from clients.scenes.catalog import build_scene
 from clients.scenes.geometry import (
     box,
