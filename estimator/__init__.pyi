@@ -19,9 +19,9 @@ from .corrections.rings import Rings as Rings
 from .corrections.worn_lens import WornLens as WornLens
 from .estimate.estimation import EstimatedEye as EstimatedEye
 from .estimate.estimation import estimate_eye as estimate_eye
-from .estimate.given_surfaces import EyeModel as EyeModel
 from .estimate.given_surfaces import GivenSurfaces as GivenSurfaces
-from .estimate.given_surfaces import eye_model as eye_model
+from .estimate.model import EyeModel as EyeModel
+from .estimate.model import eye_model as eye_model
 from .estimate.plot import draw_section as draw_section
 from .eye.checked_fields import ProfileError as ProfileError
 from .eye.parameters import EyeParameters as EyeParameters

@@ -258,7 +258,7 @@ def _surfaces(
     pupil_mm, stop_mm : float or None
         Diameter of the entrance pupil or of the iris.
     """
-    from estimator.estimate.given_surfaces import eye_model
+    from estimator.estimate.model import eye_model
     from estimator.wavefront.aberrations import pupil_magnification
 
     found = eye_model(profile)

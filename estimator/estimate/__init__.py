@@ -2,6 +2,8 @@
 
 estimation         entry point: refined, by network, or by pattern search
 given_surfaces     an eye that a profile gives by its surfaces
+surgery            an estimated eye with an implant, or with a new front of its cornea
+model              the eye of any profile
 problem            prior, compared coefficients, and the pattern search of earlier work
 bounded_fit        least squares with bounds
 measured_residual  residual of the estimate, kept as a phase

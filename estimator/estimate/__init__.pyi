@@ -1,6 +1,6 @@
 from .estimation import EstimatedEye as EstimatedEye
 from .estimation import estimate_eye as estimate_eye
-from .given_surfaces import EyeModel as EyeModel
 from .given_surfaces import GivenSurfaces as GivenSurfaces
-from .given_surfaces import eye_model as eye_model
+from .model import EyeModel as EyeModel
+from .model import eye_model as eye_model
 from .plot import plot_eye as plot_eye

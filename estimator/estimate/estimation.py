@@ -290,7 +290,7 @@ def estimate_eye(
     profile : EyeProfile
         Profile.  An eye is returned as given, with method ``given``.  A prescription
         gets typical higher-order aberrations first, with a note, unless its
-        ``higher_order`` is ``none``.
+        ``higher_order`` is ``none``.  With surgery, this is the eye before it.
     method : {"network", "refined", "search"}
         Method.  If the wavefront is outside the network's training ranges, or light
         does not pass its eye, ``network`` falls back to ``refined`` from the table,
@@ -321,6 +321,16 @@ def estimate_eye(
             f"profile kind '{profile.kind}' defines the eye by its surfaces, not by "
             "the parameters of the eye model: allowed are the other kinds"
         )
+    if profile.surgery is not None:
+        found = estimate_eye(
+            profile.before_surgery,
+            method=method,
+            max_time_s=max_time_s,
+            starts=starts,
+            start_vectors=start_vectors,
+        )
+        note = Note("eye_before_surgery", "this is the eye before surgery")
+        return replace(found, notes=(note, *found.notes))
     if profile.higher_order != "none":
         found = estimate_eye(
             with_typical_aberrations(profile),

@@ -6,7 +6,6 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from estimator.estimate.estimation import EstimatedEye, estimate_eye
 from estimator.estimate.measured_residual import MeasuredResidual
 from estimator.eye.focusing import FocusedSurfaces
 from estimator.eye.surface_eye import SurfaceEye, SurfaceModel
@@ -117,20 +116,3 @@ class GivenSurfaces:
     ) -> EyeSurfaces:
         """Return the surfaces of `focused`."""
         return self.focused(focus_dpt, pupil_diameter_mm=pupil_diameter_mm).surfaces
-
-
-EyeModel = EstimatedEye | GivenSurfaces
-"""An eye that can be traced, whatever its profile."""
-
-
-def eye_model(profile: EyeProfile) -> EyeModel:
-    """Return the eye of a profile: as given by surfaces, or estimated from the table.
-
-    Raises
-    ------
-    TraceFailed
-        Light does not pass the given eye.
-    """
-    if profile.surfaces is not None:
-        return GivenSurfaces(profile, profile.surfaces)
-    return estimate_eye(profile, starts=("table",))

@@ -67,6 +67,16 @@ def falling_count(refractions_dpt: NDArray[np.float64]) -> int:
     return int(np.argmin(usable)) if not usable.all() else usable.size
 
 
+class ResidualPhase(Protocol):
+    """Phase added to the traced eye's wavefront (`estimate.measured_residual`)."""
+
+    def on_axis_um(self, pupil_diameter_mm: ArrayLike) -> NDArray[np.float64]:
+        """Return monomials (n, n_terms) at 555 nm in the plane of pupils (n,)."""
+
+    def on_axis_dpt(self, pupil_diameter_mm: float) -> float:
+        """Return their least-squares M in a pupil."""
+
+
 State = TypeVar("State", bound=FocusedSurfaces)
 
 
@@ -97,6 +107,8 @@ class TabulatedFocusing(Focusing, Generic[State]):
     bare_refraction_dpt: float
 
     _table: FocusTable | None = None
+    _rest: ResidualPhase | None = None
+    _last_taken_off = (0.0, 0.0)
 
     def _tabulate(
         self,
@@ -104,7 +116,6 @@ class TabulatedFocusing(Focusing, Generic[State]):
         *,
         correction: rx.Prescription | None,
         amplitude_dpt: float,
-        rest_dpt: float = 0.0,
     ) -> None:
         """Trace the refraction at states of the lens, from the relaxed one on.
 
@@ -114,8 +125,6 @@ class TabulatedFocusing(Focusing, Generic[State]):
         ----------
         nodes : (n,)
             Numbers that place the states.
-        rest_dpt : float
-            M of the residual through the eye's own pupil.
 
         Raises
         ------
@@ -140,7 +149,8 @@ class TabulatedFocusing(Focusing, Generic[State]):
             correction, entrance_pupil_mm=self.entrance_pupil_mm
         )
         self.bare_refraction_dpt = refraction_at_cornea_dpt(
-            self._bare_dpt + rest_dpt, entrance_pupil_mm=self.entrance_pupil_mm
+            self._bare_dpt + float(self._rest_dpt(self.pupil_diameter_mm)[0]),
+            entrance_pupil_mm=self.entrance_pupil_mm,
         )
         at_cornea_dpt = 0.0
         if correction is not None:
@@ -214,10 +224,28 @@ class TabulatedFocusing(Focusing, Generic[State]):
         )
         return bare_dpt - self._taken_off_dpt(pupil_diameter_mm)
 
+    def _rest_dpt(self, pupil_diameter_mm: ArrayLike) -> NDArray[np.float64]:
+        """Return M (n,) of the residual on round pupils (n,)."""
+        radius_mm = np.atleast_1d(pupil_diameter_mm) / 2.0
+        if self._rest is None:
+            return np.zeros(radius_mm.size)
+        rest_um = self._rest.on_axis_um(pupil_diameter_mm)
+        zernike_um = zernike_from_polynomial(rest_um, radius_mm)
+        return total_defocus_dpt(zernike_um, radius_mm)
+
     def _taken_off_dpt(self, pupil_diameter_mm: float) -> float:
-        """Return M of the correction through a pupil."""
-        at_center_dpt, per_mm2 = self._correction_dpt
-        return at_center_dpt + per_mm2 * (pupil_diameter_mm / 2.0) ** 2
+        """Return M of the correction minus M of the residual, on a round pupil.
+
+        The last result is cached: a frame requests the same pupil several times.
+        """
+        last = self._last_taken_off
+        if last[0] != pupil_diameter_mm:
+            at_center_dpt, per_mm2 = self._correction_dpt
+            taken_off_dpt = at_center_dpt + per_mm2 * (pupil_diameter_mm / 2.0) ** 2
+            if self._rest is not None:
+                taken_off_dpt -= self._rest.on_axis_dpt(pupil_diameter_mm)
+            self._last_taken_off = last = pupil_diameter_mm, taken_off_dpt
+        return last[1]
 
     def accommodation_for_dpt(
         self, refraction_dpt: float, *, pupil_diameter_mm: float
@@ -291,16 +319,6 @@ class FocusedEye(FocusedSurfaces):
     aqueous_thickness_change_mm: float
 
 
-class ResidualPhase(Protocol):
-    """Phase added to the traced eye's wavefront (`estimate.measured_residual`)."""
-
-    def on_axis_um(self, pupil_diameter_mm: ArrayLike) -> NDArray[np.float64]:
-        """Return monomials (n, n_terms) at 555 nm in the plane of pupils (n,)."""
-
-    def on_axis_dpt(self, pupil_diameter_mm: float) -> float:
-        """Return their least-squares M in a pupil."""
-
-
 class AccommodatingEye(TabulatedFocusing[FocusedEye]):
     """An eye of 45 parameters that can focus, at any pupil.
 
@@ -338,14 +356,12 @@ class AccommodatingEye(TabulatedFocusing[FocusedEye]):
             wavelength_nm=REFERENCE_WAVELENGTH_NM,
         )
         self._rest = rest
-        self._last_taken_off = (0.0, 0.0)
         relaxed_mm = self._vector[DIAMETER]
         smallest_mm = smallest_diameter_mm(self._vector)
         self._tabulate(
             np.linspace(relaxed_mm, smallest_mm, N_TABLE),
             correction=correction,
             amplitude_dpt=amplitude_dpt,
-            rest_dpt=float(self._rest_dpt(pupil_diameter_mm)[0]),
         )
         self.lens_range_dpt = float(self._accommodations_dpt[-1])
 
@@ -356,28 +372,6 @@ class AccommodatingEye(TabulatedFocusing[FocusedEye]):
             lens_diameter_mm=diameters_mm,
             keeps_conics=self._keeps_conics,
         )
-
-    def _rest_dpt(self, pupil_diameter_mm: ArrayLike) -> NDArray[np.float64]:
-        """Return M (n,) of the residual on round pupils (n,)."""
-        radius_mm = np.atleast_1d(pupil_diameter_mm) / 2.0
-        if self._rest is None:
-            return np.zeros(radius_mm.size)
-        rest_um = self._rest.on_axis_um(pupil_diameter_mm)
-        zernike_um = zernike_from_polynomial(rest_um, radius_mm)
-        return total_defocus_dpt(zernike_um, radius_mm)
-
-    def _taken_off_dpt(self, pupil_diameter_mm: float) -> float:
-        """Return M of the correction minus M of the residual, on a round pupil.
-
-        The last result is cached: a frame requests the same pupil several times.
-        """
-        last = self._last_taken_off
-        if last[0] != pupil_diameter_mm:
-            taken_off_dpt = super()._taken_off_dpt(pupil_diameter_mm)
-            if self._rest is not None:
-                taken_off_dpt -= self._rest.on_axis_dpt(pupil_diameter_mm)
-            self._last_taken_off = last = pupil_diameter_mm, taken_off_dpt
-        return last[1]
 
     def _new_focus_table(self) -> FocusTable:
         """Trace the table, without M of the residual on a round pupil.

@@ -23,6 +23,7 @@ from numpy.typing import ArrayLike, NDArray
 from estimator.eye.accommodation import (
     N_FOCUS,
     N_TABLE,
+    ResidualPhase,
     TabulatedFocusing,
 )
 from estimator.eye.focusing import FocusedSurfaces, FocusTable, table_pupils_mm
@@ -197,6 +198,11 @@ def _entrance_pupil_mm(eye: EyeSurfaces) -> float:
 class SurfaceEye(TabulatedFocusing[FocusedSurfaces]):
     """An eye given by surfaces that can focus, at any pupil.
 
+    Parameters
+    ----------
+    rest : ResidualPhase, optional
+        Phase added to the traced eye.
+
     Raises
     ------
     TraceFailed
@@ -210,7 +216,9 @@ class SurfaceEye(TabulatedFocusing[FocusedSurfaces]):
         pupil_diameter_mm: float = 4.0,
         amplitude_dpt: float = math.inf,
         correction: rx.Prescription | None = None,
+        rest: ResidualPhase | None = None,
     ):
+        self._rest = rest
         self.model = model
         self.pupil_diameter_mm = pupil_diameter_mm
         self.entrance_pupil_mm = _entrance_pupil_mm(model.relaxed)

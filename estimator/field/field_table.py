@@ -7,7 +7,7 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from estimator.estimate.given_surfaces import EyeModel
+from estimator.estimate.model import EyeModel
 from estimator.field.prepare import prepare_eye
 from estimator.field.traced_eye import TracedEye
 from estimator.note import Note

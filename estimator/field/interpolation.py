@@ -17,7 +17,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from estimator.estimate.given_surfaces import EyeModel
+from estimator.estimate.model import EyeModel
 from estimator.eye.focusing import FocusedSurfaces
 from estimator.eye.tracing import OPEN_RATIO
 from estimator.optics.zernike import N_TERMS, monomial_degrees, radial_order

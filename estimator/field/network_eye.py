@@ -169,6 +169,8 @@ def _check_profile(profile: EyeProfile) -> None:
     """
     if profile.surfaces is not None:
         problem = f"kind '{profile.kind}' defines the eye by its surfaces"
+    elif profile.surgery is not None:
+        problem = "surgery"
     elif profile.correction is not None:
         problem = "a correction, such as spectacles or an intraocular lens"
     elif profile.retina is not None:

@@ -35,7 +35,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.estimate.estimation import EstimatedEye, estimate_eye
-from estimator.estimate.given_surfaces import EyeModel
+from estimator.estimate.model import EyeModel
 from estimator.eye.tracing import on_axis_zernike_um
 from estimator.field.interpolation import (
     FIELD_AZIMUTHS,

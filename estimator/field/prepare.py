@@ -15,8 +15,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from estimator.estimate.estimation import POOR_FIT_UM
-from estimator.estimate.given_surfaces import EyeModel, GivenSurfaces
-from estimator.estimate.given_surfaces import eye_model as model_of
+from estimator.estimate.given_surfaces import GivenSurfaces
+from estimator.estimate.model import EyeModel
+from estimator.estimate.model import eye_model as model_of
+from estimator.estimate.surgery import natural_eye
 from estimator.eye.accommodation import REFRACTION_TOLERANCE_DPT
 from estimator.eye.focusing import FocusedSurfaces
 from estimator.field.eye_optics import EyeOptics
@@ -198,7 +200,7 @@ def _merged(
 def eye_notes(estimated: EyeModel) -> tuple[str, ...]:
     """Return notes on the computation of the eye, its focus and its aberrations."""
     return (
-        _of_eye(estimated),
+        _of_eye(natural_eye(estimated)),
         Note(
             "focus_accuracy",
             f"focus traced to {REFRACTION_TOLERANCE_DPT:.0e} dpt",
@@ -317,7 +319,8 @@ def prepare_eye(
         raise ValueError(
             f"eye_model '{eye_model}': allowed are {', '.join(EYE_MODELS)}"
         )
-    if eye_model == "wavefront" and not profile.is_given:
+    is_traced = profile.is_given or profile.surgery is not None
+    if eye_model == "wavefront" and not is_traced:
         return MeasuredWavefront.from_profile(profile), profile.notes
 
     report = progress or (lambda fraction, stage: None)

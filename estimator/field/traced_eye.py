@@ -17,7 +17,7 @@ from estimator.corrections.progressive import (
     progressive_polynomial,
 )
 from estimator.corrections.worn_lens import rings_of, worn_polynomial
-from estimator.estimate.given_surfaces import EyeModel
+from estimator.estimate.model import EyeModel
 from estimator.eye.focusing import FocusingEye
 from estimator.field.interpolation import (
     AberrationGrid,

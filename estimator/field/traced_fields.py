@@ -14,8 +14,10 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.estimate.given_surfaces import EyeModel, GivenSurfaces
+from estimator.estimate.given_surfaces import GivenSurfaces
 from estimator.estimate.measured_residual import OVERSHOOT, MeasuredResidual
+from estimator.estimate.model import EyeModel
+from estimator.estimate.surgery import natural_eye
 from estimator.eye.tracing import TraceFailed
 from estimator.field.interpolation import (
     AberrationGrid,
@@ -424,6 +426,7 @@ def peripheral_residual(
     It is None if the eye has the periphery of the model, because the profile requests
     it or the phase cannot be traced over the whole range.
     """
+    eye = natural_eye(eye)  # surgery does not change the retina
     if isinstance(eye, GivenSurfaces) or eye.profile.periphery == "model":
         return None
     if not np.any(np.concatenate(nodes_deg)):

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.corrections.worn_lens import rings_of
-from estimator.estimate.given_surfaces import EyeModel, eye_model
+from estimator.estimate.model import EyeModel, eye_model
 from estimator.field.field_table import traced_directions
 from estimator.field.traced_eye import TracedEye
 from estimator.image_quality.pupil_light import PupilLight

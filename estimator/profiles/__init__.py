@@ -1,11 +1,13 @@
 """Eye profiles: prescriptions, measurements and eye models.
 
 bodies               types of the profile object: fields, ranges, defaults
+correction_bodies    the same for corrections
 given_bodies         the same for eyes given by their surfaces, and all bodies
 validation           conversion of plain data to these types, and its errors
 eye_profile          the parsed profile
 common_fields        from the fields that all types share, and the correction
 parse                from a typed profile to an `EyeProfile`
+surgery              surgery that a correction describes
 given_eyes           from a typed profile to an eye given by its surfaces
 surfaces             from typed surfaces to an eye; schematic eyes of the literature
 reference            JSON Schema, tables and limits of the typed profiles

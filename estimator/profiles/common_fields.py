@@ -19,6 +19,7 @@ from estimator.corrections.rings import (
 )
 from estimator.corrections.worn_lens import (
     TEAR_FILM_RATIO,
+    TYPICAL_DEPTH_MM,
     WornLens,
     diameter_at_pupil_mm,
     power_at_pupil_dpt,
@@ -31,7 +32,7 @@ from estimator.optics import prescription as rx
 from estimator.optics.units import MM_PER_M
 from estimator.optics.vergence import TYPICAL_ENTRANCE_PUPIL_MM
 from estimator.profiles import bodies
-from estimator.profiles.bodies import (
+from estimator.profiles.correction_bodies import (
     CONTACT_OPTIC_MM,
     CORNEA_SPHERICAL_ABERRATION_UM,
     OPTIC_MM,
@@ -39,12 +40,18 @@ from estimator.profiles.bodies import (
     ContactLensBody,
     CorrectionBody,
     IntraocularLensBody,
+    LaserBody,
     LensletsBody,
     MonofocalBody,
     ProgressiveBody,
     SpectaclesBody,
     TrifocalBody,
     ZonesBody,
+)
+from estimator.profiles.surgery import (
+    ImplantSurgery,
+    parse_surgery,
+    remaining_notes,
 )
 
 if TYPE_CHECKING:
@@ -111,6 +118,8 @@ def parse_correction(
                 rings=_contact_zones(body),
                 design="rigid" if body.rigid else "",
             )
+        case LaserBody():
+            return None  # it changes the eye; see `surgery`
     return _intraocular(body, has_cornea=has_cornea)
 
 
@@ -224,12 +233,18 @@ def _lens_at_the_eye(
 
 
 def _intraocular(body: IntraocularLensBody, *, has_cornea: bool) -> WornLens:
-    """Return an intraocular lens, its powers converted to the entrance pupil."""
-    depth_mm = body.depth_mm
+    """Return an intraocular lens, its powers converted to the entrance pupil.
+
+    An implant whose power is solved is traced; its correction has only the rings.
+    """
+    depth_mm = _depth_mm(body)
     lens = _lens_at_the_eye(body, "iol")
     for name in ("sphere_dpt", "cylinder_dpt"):
         lens[name] = power_at_pupil_dpt(lens[name], depth_mm=depth_mm)
-    lens["spherical_aberration_um"] += _cornea_um(body, has_cornea=has_cornea)
+    if body.residual_sphere_dpt is UNSET:
+        lens["spherical_aberration_um"] += _cornea_um(body, has_cornea=has_cornea)
+    else:
+        lens |= {"spherical_aberration_um": 0.0}
     return WornLens(
         **lens,
         vertex_mm=-TYPICAL_ENTRANCE_PUPIL_MM,
@@ -238,6 +253,10 @@ def _intraocular(body: IntraocularLensBody, *, has_cornea: bool) -> WornLens:
         design=str(body.__struct_config__.tag).partition("/")[2],
         depth_mm=depth_mm,
     )
+
+
+def _depth_mm(body: IntraocularLensBody) -> float:
+    return TYPICAL_DEPTH_MM if body.depth_mm is UNSET else body.depth_mm
 
 
 def _cornea_um(body: IntraocularLensBody, *, has_cornea: bool) -> float:
@@ -269,13 +288,13 @@ def _rings(body: IntraocularLensBody) -> Rings | None:
             spacing_dpt, orders, far_order = body.add_dpt, (1, 2), 1
             kinoform = Kinoform.sawtooth(body.step_waves)
     return DiffractiveRings(
-        spacing_dpt=power_at_pupil_dpt(spacing_dpt, depth_mm=body.depth_mm),
+        spacing_dpt=power_at_pupil_dpt(spacing_dpt, depth_mm=_depth_mm(body)),
         kinoform=kinoform,
         orders=orders,
         far_order=far_order,
         design_nm=body.design_wavelength_nm,
         diameter_mm=diameter_at_pupil_mm(
-            body.rings_diameter_mm, depth_mm=body.depth_mm
+            body.rings_diameter_mm, depth_mm=_depth_mm(body)
         ),
         centre_mm=body.decentration_mm,
     )
@@ -345,7 +364,7 @@ def _zones(body: ZonesBody) -> RefractiveZones:
     diameters_mm = _checked_diameters_mm(
         body.zone_adds_dpt, body.zone_diameters_mm, largest_mm=OPTIC_MM
     )
-    depth_mm = body.depth_mm
+    depth_mm = _depth_mm(body)
     return RefractiveZones(
         outer_mm=tuple(
             diameter_at_pupil_mm(d, depth_mm=depth_mm) / 2.0 for d in diameters_mm
@@ -422,7 +441,9 @@ def common_fields(body: bodies.CommonBody, kind: str) -> dict[str, Any]:
     age_years = None if body.age_years is msgspec.UNSET else body.age_years
     if body.yellowing is not None and age_years is None:
         raise ProfileError("age_years", "is required with yellowing", "3 to 120")
-    if body.spectacle_magnification and body.correction is None:
+    if body.spectacle_magnification and (
+        body.correction is None or isinstance(body.correction, LaserBody)
+    ):
         raise ProfileError(
             "correction", "is required with spectacle_magnification", "an object"
         )
@@ -435,24 +456,31 @@ def common_fields(body: bodies.CommonBody, kind: str) -> dict[str, Any]:
                 "false, or the surfaces of the lens as parts of the eye",
             )
         notes = (RIGID_NOTE,)
+    surgery = parse_surgery(body.correction)
+    is_exchanged = isinstance(surgery, ImplantSurgery)
     retina = None
     if isinstance(body.retina, bodies.RetinaBody):
         retina = RetinaShape(
             radius_mm=body.retina.radius_mm, conic_constant=body.retina.conic_constant
         )
-    is_prescription = isinstance(body, bodies.PrescriptionBody)
+    entered = None
+    if isinstance(body, bodies.PrescriptionBody):
+        entered = prescription(body, path="")
     return {
         "name": kind
         if body.name is msgspec.UNSET
         else printable(str(body.name), most=MAX_NAME_CHARACTERS),
         "eye_side": body.eye_side,
         "age_years": age_years,
-        "correction": parse_correction(body.correction, has_cornea=not is_prescription),
+        "correction": parse_correction(body.correction, has_cornea=entered is None),
+        "surgery": surgery,
         "retina": retina,
         "periphery": _periphery(body),
         "sample": _sample(body),
-        "straylight": _straylight(body.straylight, age_years),
-        "yellowing": body.yellowing,
+        "straylight": _straylight(
+            body.straylight, age_years, is_cataract_gone=is_exchanged
+        ),
+        "yellowing": None if is_exchanged else body.yellowing,
         "spectacle_magnification": body.spectacle_magnification,
         "notes": (
             *(note_of(n.code, printable(n.text), n.values) for n in body.notes),
@@ -461,8 +489,22 @@ def common_fields(body: bodies.CommonBody, kind: str) -> dict[str, Any]:
                 body.correction,
             ),
             *notes,
+            *remaining_notes(body.correction, entered),
+            *(_removed_notes(body) if is_exchanged else ()),
         ),
     }
+
+
+def _removed_notes(body: bodies.CommonBody) -> tuple[Note, ...]:
+    """Return a note on what goes with the natural lens."""
+    gone = ["accommodation"]
+    if isinstance(body.straylight, bodies.StraylightBody):
+        if body.straylight.cataract is not UNSET:
+            gone.append("the straylight of the cataract")
+    if body.yellowing is not None:
+        gone.append("the yellowing of the lens")
+    text = f"gone with the natural lens: {', '.join(gone)}"
+    return (Note("natural_lens_removed", text),)
 
 
 def _periphery(body: bodies.CommonBody) -> str:
@@ -496,7 +538,10 @@ def _sample(body: bodies.CommonBody) -> int | None:
 
 
 def _straylight(
-    body: bodies.StraylightBody | None, age_years: float | None
+    body: bodies.StraylightBody | None,
+    age_years: float | None,
+    *,
+    is_cataract_gone: bool,
 ) -> Straylight | None:
     if body is None:
         return None
@@ -506,7 +551,7 @@ def _straylight(
             raise ProfileError(
                 "straylight.log_s", "cannot be combined with cataract", "one of the two"
             )
-        log_s = CATARACTS[body.cataract]
+        log_s = None if is_cataract_gone else CATARACTS[body.cataract]
     return Straylight(
         age_years=DEFAULT_AGE_YEARS if age_years is None else age_years,
         pigment_ratio=body.pigmentation,

@@ -14,6 +14,7 @@ from estimator.eye.parameters import EyeParameters, RetinaShape
 from estimator.media import Straylight
 from estimator.optics import prescription as rx
 from estimator.optics.units import REFERENCE_WAVELENGTH_NM
+from estimator.profiles.surgery import Surgery
 
 if TYPE_CHECKING:
     from estimator.eye.surface_eye import SurfaceModel
@@ -93,6 +94,9 @@ class EyeProfile:
         or the mean eye.
     notes : tuple of str
         Notes on powers at their distance from the cornea, and at the cornea.
+    surgery : Surgery or None
+        Surgery after the measurements, which describe the eye before it; the eye is
+        traced after it.
     """
 
     name: str
@@ -115,11 +119,17 @@ class EyeProfile:
     notes: tuple[str, ...] = ()
     surfaces: "SurfaceModel | None" = None
     sample: int | None = None
+    surgery: Surgery | None = None
 
     @property
     def is_given(self) -> bool:
         """Return whether the profile gives the eye itself instead of measurements."""
         return self.eye is not None or self.surfaces is not None
+
+    @property
+    def before_surgery(self) -> "EyeProfile":
+        """Return the profile of the same eye without its surgery and correction."""
+        return replace(self, surgery=None, correction=None)
 
     @cached_property
     def compared_measurements(self) -> tuple[Measurement, ...]:
@@ -137,12 +147,12 @@ class EyeProfile:
 
         Profiles that describe the same eye in different formats have the same digest.
         """
-        content = replace(self, name="", notes=())
+        content = replace(self, name="", notes=(), surfaces=None)
         encoded = msgspec.json.encode(
-            replace(content, surfaces=None),
-            order="deterministic",
-            enc_hook=lambda array: array.tolist(),
+            content, order="deterministic", enc_hook=lambda array: array.tolist()
         )
+        # eyes without surgery keep the digest that they had in version 0.2
+        encoded = encoded.replace(b',"surgery":null}', b"}")
         if self.surfaces is not None:
             encoded += self.surfaces.digest.encode()
         return hashlib.sha256(encoded).hexdigest()

@@ -22,7 +22,6 @@ from estimator.optics.surfaces import MAX_SURFACES, OFFSET_RADIUS_MM
 from estimator.optics.zernike import N_TERMS
 from estimator.profiles.bodies import (
     PUBLISHED_NAMES,
-    Body,
     CommonBody,
     EyeBody,
     Frame,
@@ -33,6 +32,7 @@ from estimator.profiles.bodies import (
     ZernikeSetBody,
 )
 from estimator.profiles.coefficients import CorneaCoefficientsUm
+from estimator.profiles.correction_bodies import Body
 from estimator.profiles.validation import ALLOWED
 
 NUMBER_LIMIT = 1e9

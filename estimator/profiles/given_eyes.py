@@ -35,9 +35,9 @@ from estimator.optics.surfaces import (
 from estimator.optics.units import MM_PER_M, REFERENCE_WAVELENGTH_NM
 from estimator.optics.zernike import DEFAULT_ORDER, N_TERMS, norms
 from estimator.profiles import bodies, given_bodies
-from estimator.profiles.bodies import IntraocularBody
 from estimator.profiles.coefficients import coefficients_um
 from estimator.profiles.common_fields import common_fields
+from estimator.profiles.correction_bodies import IntraocularBody
 from estimator.profiles.eye_profile import SURFACES_PUPIL_MM, EyeProfile
 from estimator.profiles.given_bodies import ImplantBody, PseudophakicBody
 from estimator.profiles.surfaces import published_eye, radii_mm, surface_model
@@ -242,14 +242,9 @@ def _retina(body: PseudophakicBody) -> Retina:
     )
 
 
-def _with_cornea(eye: EyeSurfaces, cornea_um: Numbers, radius_mm: float) -> EyeSurfaces:
-    """Return the eye with offsets of the cornea that give it measured aberrations.
-
-    The cornea is traced alone, onto a screen in its focus; offsets change until its
-    higher orders are those measured.
-    """
+def cornea_alone(eye: EyeSurfaces) -> EyeSurfaces:
+    """Return the cornea of an eye, in front of a screen in its focus."""
     from estimator.optics.paraxial import system_matrix  # compiled: loads slowly
-    from estimator.wavefront.aberrations import on_axis_zernike
 
     cornea = eye.surfaces[:2]
     indices = media_indices(replace(eye, surfaces=cornea), REFERENCE_WAVELENGTH_NM)
@@ -258,7 +253,20 @@ def _with_cornea(eye: EyeSurfaces, cornea_um: Numbers, radius_mm: float) -> EyeS
     )
     matrix = system_matrix(pack_eye(alone), indices, first=0, last=2)
     focus_mm = cornea[1].z_mm - indices[2] * matrix[0, 0] / matrix[1, 0]
-    alone = replace(alone, retina=Retina(math.inf, 0.0, float(focus_mm)))
+    return replace(alone, retina=Retina(math.inf, 0.0, float(focus_mm)))
+
+
+def _with_cornea(eye: EyeSurfaces, cornea_um: Numbers, radius_mm: float) -> EyeSurfaces:
+    """Return the eye with offsets of the cornea that give it measured aberrations.
+
+    The cornea is traced alone, onto a screen in its focus; offsets change until its
+    higher orders are those measured.
+    """
+    from estimator.wavefront.aberrations import on_axis_zernike  # loads slowly
+
+    cornea = eye.surfaces[:2]
+    alone = cornea_alone(eye)
+    indices = media_indices(replace(eye, surfaces=cornea), REFERENCE_WAVELENGTH_NM)
     offset_mm = np.zeros(N_TERMS)
     for _ in range(MAX_CORNEA_STEPS):
         anterior = replace(cornea[0], offset_mm=offset_mm, offset_radius_mm=radius_mm)
@@ -366,6 +374,14 @@ def _with_surfaces(
     body: bodies.CommonBody, kind: str, surfaces: SurfaceModel | None
 ) -> EyeProfile:
     common = common_fields(body, kind)
+    if common["surgery"] is not None:
+        raise ProfileError(
+            "correction.residual_sphere_dpt"
+            if isinstance(body.correction, IntraocularBody)
+            else "correction.kind",
+            "describes surgery of an eye that is estimated from measurements",
+            "kinds prescription, preset, zernike, zernike_set and eye",
+        )
     if kind != "pseudophakic" and replaces_lens(common["correction"]):
         raise ProfileError(
             "correction.kind",

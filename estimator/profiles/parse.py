@@ -28,6 +28,7 @@ from estimator.profiles import bodies
 from estimator.profiles.coefficients import measured_um, order_notes
 from estimator.profiles.common_fields import common_fields, prescription
 from estimator.profiles.eye_profile import EYE_PUPIL_MM, EyeProfile, Measurement
+from estimator.profiles.surgery import Surgery
 from estimator.profiles.validation import KIND, convert
 from estimator.wavefront.field_wavefronts import polynomial_in_mm, rays_cross
 
@@ -202,16 +203,18 @@ def _prescription(body: bodies.PrescriptionBody) -> EyeProfile:
         ),
         max_pupil_diameter_mm=math.inf,
         add_dpt=body.add_dpt,
-        higher_order=_higher_order(body, common["correction"]),
+        higher_order=_higher_order(body, common["correction"], common["surgery"]),
         **common,
     )
 
 
 def _higher_order(
-    body: bodies.PrescriptionBody, correction: rx.Prescription | None
+    body: bodies.PrescriptionBody,
+    correction: rx.Prescription | None,
+    surgery: Surgery | None,
 ) -> str:
-    """Return "typical" or "none"; "none" with an intraocular lens."""
-    is_gone = replaces_lens(correction)
+    """Return "typical" or "none"; "none" for an eye after lens surgery."""
+    is_gone = replaces_lens(correction) and surgery is None
     if body.higher_order is msgspec.UNSET:
         return "none" if is_gone else "typical"
     if is_gone and body.higher_order != "none":

@@ -12,6 +12,7 @@ from msgspec import inspect
 from estimator.profiles import (
     bodies,
     coefficients,
+    correction_bodies,
     given_bodies,
 )
 from estimator.profiles.validation import ALLOWED, KIND, allowed_values
@@ -29,18 +30,20 @@ INTRODUCTIONS: dict[type[msgspec.Struct], str] = {
     coefficients.OrderedZernikeBody: "`zernike` of a measurement.",
     bodies.RetinaBody: "`retina`.",
     bodies.StraylightBody: "`straylight`; an empty object uses the defaults.",
-    bodies.PowersBody: "`correction`: fields of every kind.",
-    bodies.SpectaclesBody: "`correction` of kind `spectacles` (default).",
-    bodies.ProgressiveBody: "`correction` of kind `progressive`.",
-    bodies.LensletsBody: "`correction` of kind `lenslets`.",
-    bodies.ContactLensBody: "`correction` of kind `contact_lens`.",
-    bodies.IntraocularBody: "`correction` of kind `iol`: every design.",
-    bodies.DiffractiveBody: "`correction` of kind `iol`: designs `bifocal`, "
+    correction_bodies.PowersBody: "`correction`: fields of every kind.",
+    correction_bodies.SpectaclesBody: "`correction` of kind `spectacles` (default).",
+    correction_bodies.ProgressiveBody: "`correction` of kind `progressive`.",
+    correction_bodies.LensletsBody: "`correction` of kind `lenslets`.",
+    correction_bodies.ContactLensBody: "`correction` of kind `contact_lens`.",
+    correction_bodies.IntraocularBody: "`correction` of kind `iol`: every design.",
+    correction_bodies.DiffractiveBody: "`correction` of kind `iol`: designs `bifocal`, "
     "`trifocal` and `edof`.",
-    bodies.BifocalBody: "Design `bifocal`.",
-    bodies.TrifocalBody: "Design `trifocal`.",
-    bodies.ExtendedDepthBody: "Design `edof`.",
-    bodies.ZonesBody: "Design `zones`.",
+    correction_bodies.BifocalBody: "Design `bifocal`.",
+    correction_bodies.TrifocalBody: "Design `trifocal`.",
+    correction_bodies.ExtendedDepthBody: "Design `edof`.",
+    correction_bodies.ZonesBody: "Design `zones`.",
+    correction_bodies.LaserBody: "`correction` of kind `laser`: the eye after laser "
+    "surgery of the cornea.",
     bodies.EyeBody: "Kind `eye`: the eye model by its parameters.",
     bodies.ParametersBody: "`parameters`.",
     given_bodies.SurfacesBody: "Kind `surfaces`: an eye by its surfaces and media.",

@@ -7,7 +7,7 @@ interpolation, and fitted by least squares at points inside the pupil.
 import numpy as np
 import pytest
 
-from estimator.estimate.given_surfaces import eye_model
+from estimator.estimate.model import eye_model
 from estimator.eye.focusing import OUT_OF_REACH_DPT
 from estimator.field.prepare import prepare_eye
 from estimator.optics.zernike import exponents

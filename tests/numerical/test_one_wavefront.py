@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 
 from clients.commands.optics import _state
-from estimator.estimate.given_surfaces import eye_model
+from estimator.estimate.model import eye_model
 from estimator.field.field_table import field_table
 from estimator.field.prepare import prepare_eye
 from estimator.optics.units import MRAD_PER_RAD

@@ -7,7 +7,7 @@ import pytest
 from scipy.optimize import brentq
 
 from estimator import power_vector_from_zernike, prescription_from_power_vector
-from estimator.estimate.given_surfaces import eye_model
+from estimator.estimate.model import eye_model
 from estimator.optics.zernike import index_from_nm
 from estimator.profiles.given_eyes import biconvex_radius_mm
 from estimator.profiles.parse import parse_profile

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from estimator.estimate.given_surfaces import eye_model
+from estimator.estimate.model import eye_model
 from estimator.eye.assembly import accommodated, eye_surfaces
 from estimator.eye.parameters import PARAMETER_NAMES, EyeParameters
 from estimator.eye.surface_eye import StatesDiffer, SurfaceModel

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from estimator.estimate.given_surfaces import eye_model
+from estimator.estimate.model import eye_model
 from estimator.field.field_table import field_table
 from estimator.optics.zernike import rescale_pupil
 from estimator.profiles.files import load_profile
