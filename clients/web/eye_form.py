@@ -10,7 +10,7 @@ import math
 import tempfile
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -25,7 +25,10 @@ from clients.web.controls import (
     NEAR_ADD,
     PRESCRIPTION,
     PROGRESSIVE_ADD,
+    RESIDUAL,
+    RESIDUAL_SPHERE,
     SPHERE,
+    STRAYLIGHT,
     VERTEX,
     NumberField,
     initial_texts,
@@ -54,7 +57,7 @@ PRESET_TITLES = {
 }
 
 WornKind = Literal[
-    "spectacles", "progressive", "lenslets", "contact_lens", "iol", "file"
+    "spectacles", "progressive", "lenslets", "contact_lens", "iol", "laser", "file"
 ]
 
 KINDS: dict[WornKind, str] = {
@@ -63,8 +66,34 @@ KINDS: dict[WornKind, str] = {
     "lenslets": "Spectacles with lenslets",
     "contact_lens": "Contact lens",
     "iol": "Intraocular lens",
+    "laser": "Laser surgery",
 }
 AS_IN_FILE = "As in the file"
+SURGERIES: tuple[WornKind, ...] = ("iol", "laser")
+"""Kinds that change the eye of the entries above them."""
+
+Haze = Literal[
+    "none", "age", "nuclear", "cortical", "posterior_subcapsular", "measured"
+]
+HAZES: dict[Haze, str] = {
+    "none": "No straylight",
+    "age": "Straylight of this age",
+    "nuclear": "Nuclear cataract",
+    "cortical": "Cortical cataract",
+    "posterior_subcapsular": "Posterior subcapsular cataract",
+    "measured": "Measured straylight",
+}
+Yellowing = Literal["none", "seen", "adapted"]
+YELLOWINGS: dict[Yellowing, str] = {
+    "none": "No yellowing of the lens",
+    "seen": "Yellowing of this age",
+    "adapted": "Yellowing of this age, adapted to white",
+}
+YOUNG_YEARS = 25.0
+"""Age of the eye to which straylight is compared."""
+
+CATARACT = "cataract"
+"""Preset that has the haze of a cataract when it is selected."""
 DESIGNS = {
     "monofocal": "Monofocal",
     "bifocal": "Bifocal",
@@ -76,9 +105,12 @@ HINTS: dict[WornKind, str] = {
     "gaze sliders to look through other parts of the lens.",
     "lenslets": "396 lenslets around a clear center; use the gaze sliders to look "
     "through other parts.",
-    "iol": "Replaces the natural lens: enter the refraction that remains after surgery "
-    "above. Accommodation and age-typical aberrations are not applied. Powers apply at "
-    "the lens.",
+    "iol": "Replaces the natural lens of the eye above, whose length and cornea stay. "
+    "Its power is chosen such that the residual refraction remains: 0 is sharp far "
+    "away. Accommodation, and haze and yellowing of the natural lens, are gone. "
+    "Additions apply at the lens.",
+    "laser": "Reshapes the cornea of the eye above, such that the residual refraction "
+    "remains. Everything else in the eye stays.",
 }
 
 FIELDS_BY_KIND: dict[WornKind, tuple[NumberField, ...]] = {
@@ -86,7 +118,8 @@ FIELDS_BY_KIND: dict[WornKind, tuple[NumberField, ...]] = {
     "progressive": (*PRESCRIPTION, PROGRESSIVE_ADD, CORRIDOR),
     "lenslets": PRESCRIPTION,
     "contact_lens": (*PRESCRIPTION[:3], ABERRATION),
-    "iol": (*PRESCRIPTION[:3], ABERRATION),
+    "iol": (*RESIDUAL, ABERRATION),
+    "laser": (*RESIDUAL, ABERRATION),
     "file": (),
 }
 FIELDS_BY_DESIGN: dict[str, tuple[NumberField, ...]] = {
@@ -206,7 +239,8 @@ class CorrectionForm:
             adds = values.pop("adds_dpt", ())
             values |= dict(zip((MIDDLE_ADD.name, NEAR_ADD.name), adds, strict=False))
         known: tuple[NumberField, ...] | None = None
-        if kind in KINDS and design in DESIGNS:
+        is_known = kind in KINDS and design in DESIGNS
+        if is_known and not _is_after_surgery(values):
             known = CorrectionForm(kind, design).entries
         names = {entry.name for entry in known or ()}
         if known is None or not set(values) <= {"kind", "design"} | names:
@@ -218,6 +252,31 @@ class CorrectionForm:
             value = values.get(entry.name)
             shown = absent[entry.name] if value is None else entry.show(value)
             self.texts[entry.name] = shown
+
+
+def is_of_version_0_2(kind: str, texts: Mapping[str, Any]) -> bool:
+    """Return whether a link's correction is an implant of version 0.2."""
+    return kind == "iol" and RESIDUAL_SPHERE.name not in texts
+
+
+def implant_of_version_0_2(design: str, texts: Mapping[str, str]) -> CorrectionForm:
+    """Return the implant of a link of version 0.2, with its meaning.
+
+    The prescription is the refraction after surgery, and the lens's own powers add to
+    it.  A lens with an invalid entry becomes a new implant.
+    """
+    old = CorrectionForm("iol", design)
+    old.texts |= texts
+    try:
+        body = old.body()
+        powers = read_numbers(PRESCRIPTION[:3], old.texts)
+    except ValueError:
+        return old
+    for entry in RESIDUAL:
+        del body[entry.name]
+    form = CorrectionForm()
+    form.take(body | powers)
+    return form
 
 
 def _texts_at_cornea(lens: Mapping[str, float]) -> dict[str, str]:
@@ -283,6 +342,9 @@ class EyeForm:
     file_name : name of that file
     loaded_name : name of the file that the entries were loaded from, or empty
     wears_correction : whether `worn` applies
+    haze : straylight of the eye
+    log_s : its parameter as typed, for "measured"
+    yellowing : of the natural lens
     """
 
     side: EyeSide
@@ -295,6 +357,18 @@ class EyeForm:
     loaded_name: str = ""
     wears_correction: bool = False
     worn: CorrectionForm = field(default_factory=CorrectionForm)
+    haze: Haze = "none"
+    log_s: str = STRAYLIGHT.show(STRAYLIGHT.initial)
+    yellowing: Yellowing = "none"
+
+    @property
+    def applies_higher_order(self) -> bool:
+        """Return whether the typical aberrations of the age can be applied.
+
+        Not to a prescription that is the refraction after lens surgery.
+        """
+        worn = self.worn.file_body if self.worn.kind == "file" else None
+        return not (self.wears_correction and _is_after_surgery(worn or {}))
 
     def body(self, *, age_years: float) -> dict[str, Any]:
         """Return the profile.
@@ -305,12 +379,54 @@ class EyeForm:
             If an entry is invalid; the message contains its value and the range.
         """
         body = {**self._source_body(), "age_years": age_years, "eye_side": self.side}
+        body |= self._media()
         if self.wears_correction:
             body["correction"] = self.worn.body()
-            if self.worn.kind == "iol":  # no natural lens, no typical aberrations
+            if not self.applies_higher_order:
                 body.pop("higher_order", None)
         parse_profile(body)
         return body
+
+    def _media(self) -> dict[str, Any]:
+        """Return the straylight and yellowing of the entries."""
+        found: dict[str, Any] = {}
+        if self.haze == "measured":
+            found["straylight"] = {STRAYLIGHT.name: STRAYLIGHT.read(self.log_s)}
+        elif self.haze != "none":
+            is_typical = self.haze == "age"
+            found["straylight"] = {} if is_typical else {"cataract": self.haze}
+        if self.yellowing != "none":
+            found["yellowing"] = self.yellowing
+        return found
+
+    def haze_text(self, *, age_years: float) -> str:
+        """Return how much light the eye scatters, in a sentence; empty without.
+
+        A cataract's straylight goes with the natural lens.
+        """
+        try:
+            haze = parse_profile(self.body(age_years=age_years)).straylight
+        except ValueError:  # reported at its entry
+            return ""
+        if haze is None:
+            return ""
+        log_s = haze.age_log_s if haze.log_s is None else haze.log_s
+        young = replace(haze, age_years=YOUNG_YEARS).age_log_s
+        by_age = 10.0 ** (log_s - haze.age_log_s)
+        return (
+            f"{100.0 * haze.fraction:.0f} % of the light is scattered over the scene: "
+            f"{10.0 ** (log_s - young):.1f} times as much as in a young eye, and "
+            f"{by_age:.1f} times as much as is usual at this age (log s {log_s:.2f} "
+            "at 7°)."
+        )
+
+    def choose_preset(self, name: str) -> None:
+        """Select a preset; a cataract comes with haze and a yellow lens."""
+        if name == CATARACT and self.preset != CATARACT:
+            self.haze, self.yellowing = "posterior_subcapsular", "seen"
+        elif self.preset == CATARACT and name != CATARACT:
+            self.haze, self.yellowing = "none", "none"
+        self.preset = name
 
     def _source_body(self) -> dict[str, Any]:
         if self.source == "preset":
@@ -333,7 +449,13 @@ class EyeForm:
         self.wears_correction = True
 
     def choose_worn(self, kind: WornKind) -> None:
-        """Select a kind of lens; without power, it gets the prescription's power."""
+        """Select a kind of correction; its powers start as that kind needs them.
+
+        Progressive lenses and lenslets without power get the prescription's.  After
+        surgery nothing remains, until the entries say so.
+        """
+        if kind in SURGERIES and self.worn.kind not in SURGERIES:
+            self.worn.texts |= initial_texts(RESIDUAL)
         self.worn.kind = kind
         if kind in ("progressive", "lenslets") and self.source == "prescription":
             with suppress(ValueError):  # an invalid entry stays
@@ -359,6 +481,7 @@ class EyeForm:
         if correction is not None:
             self.wears_correction = True
             self.worn.take(correction)
+        self._take_media(body)
         if body.get("kind") == "preset":
             self.source, self.preset = "preset", body["name"]
         elif body.get("kind") == "prescription" and set(body) <= ENTERED:
@@ -367,6 +490,30 @@ class EyeForm:
             self.has_higher_order = body.get("higher_order", "typical") == "typical"
         else:
             self.source, self.file_body, self.file_name = "file", body, name
+
+    def _take_media(self, body: dict[str, Any]) -> None:
+        """Set haze and yellowing from a profile, and remove them from it.
+
+        Straylight that the entries cannot represent stays in the profile.
+        """
+        self.haze, self.yellowing = "none", body.pop("yellowing", None) or "none"
+        light = body.get("straylight")
+        if light is None:
+            body.pop("straylight", None)
+        elif not light:
+            self.haze = "age"
+        elif set(light) == {"cataract"}:
+            self.haze = light["cataract"]
+        elif set(light) == {STRAYLIGHT.name}:
+            self.haze = "measured"
+            self.log_s = STRAYLIGHT.show(light[STRAYLIGHT.name])
+        if self.haze != "none":
+            del body["straylight"]
+
+
+def _is_after_surgery(worn: Mapping[str, Any]) -> bool:
+    """Return whether a correction makes a prescription that after lens surgery."""
+    return worn.get("kind") == "iol" and RESIDUAL_SPHERE.name not in worn
 
 
 def read_profile_file(name: str, content: bytes) -> dict[str, Any]:

@@ -25,13 +25,17 @@ from clients.web.controls import (
 )
 from clients.web.eye_form import (
     DESIGNS,
+    HAZES,
     KINDS,
     SIDES,
+    YELLOWINGS,
     CorrectionForm,
     EyeForm,
     EyeSide,
     NoFile,
     Source,
+    implant_of_version_0_2,
+    is_of_version_0_2,
     preset_titles,
     profile_for_gaze,
     read_profile_file,
@@ -280,6 +284,9 @@ def _eye_entries(form: EyeForm) -> dict[str, Any]:
         "file": form.file_name[:MAX_ENTRY_CHARACTERS] if is_file else None,
         "preset": form.preset,
         "higher_order": form.has_higher_order,
+        "haze": form.haze,
+        "log_s": form.log_s,
+        "yellowing": form.yellowing,
         "texts": form.texts,
         "correction": entries if form.wears_correction else {},
     }
@@ -389,6 +396,9 @@ def _restore_eye(form: EyeForm, entries: dict[str, Any]) -> list[str]:
     if entries.get("preset", form.preset) != form.preset:
         problems.append(f"preset {_short(entries['preset'])} is unknown")
     form.has_higher_order = entries.get("higher_order") is not False
+    form.haze = _choice(entries, "haze", HAZES) or form.haze
+    form.log_s = str(entries.get("log_s", form.log_s))[:MAX_ENTRY_CHARACTERS]
+    form.yellowing = _choice(entries, "yellowing", YELLOWINGS) or form.yellowing
     problems += _restore_texts(form.texts, _mapping(entries, "texts"))
     correction = _mapping(entries, "correction")
     if correction:
@@ -398,6 +408,8 @@ def _restore_eye(form: EyeForm, entries: dict[str, Any]) -> list[str]:
             problems.append(f"correction {_short(correction.get('kind'))} is unknown")
         form.worn.design = _choice(correction, "design", DESIGNS) or form.worn.design
         problems += _restore_texts(form.worn.texts, _mapping(correction, "texts"))
+        if is_of_version_0_2(form.worn.kind, _mapping(correction, "texts")):
+            form.worn = implant_of_version_0_2(form.worn.design, form.worn.texts)
     return problems
 
 

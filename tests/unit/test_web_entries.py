@@ -19,6 +19,7 @@ from clients.web.controls import (
 from clients.web.eye_form import (
     DESIGNS,
     KINDS,
+    SURGERIES,
     CorrectionForm,
     EyeForm,
     preset_titles,
@@ -99,9 +100,15 @@ def test_a_wrong_worn_entry_is_told_as_such():
 def test_every_lens_of_the_page_is_one_that_a_profile_may_have(kind, design, source):
     form = EyeForm("OD", source=source, wears_correction=True)
     form.worn.kind, form.worn.design = kind, design
-    form.worn.texts.update(cylinder_dpt="-1.00", axis_deg="20")
+    powers = {"cylinder_dpt": "-1.00", "axis_deg": "20"}
+    is_surgery = kind in SURGERIES
+    form.worn.texts |= {
+        f"residual_{name}" if is_surgery else name: text
+        for name, text in powers.items()
+    }
     body = form.body(age_years=70.0)
-    assert parse_profile(body).correction is not None
+    found = parse_profile(body)
+    assert (found.surgery if is_surgery else found.correction) is not None
     again = EyeForm("OD")
     again.load_body(body, "p.json")
     assert again.worn == form.worn
