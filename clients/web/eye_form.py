@@ -343,7 +343,7 @@ class EyeForm:
     loaded_name : name of the file that the entries were loaded from, or empty
     wears_correction : whether `worn` applies
     haze : straylight of the eye
-    log_s : its parameter as typed, for "measured"
+    media_texts : its parameter as typed, for "measured"
     yellowing : of the natural lens
     """
 
@@ -358,7 +358,9 @@ class EyeForm:
     wears_correction: bool = False
     worn: CorrectionForm = field(default_factory=CorrectionForm)
     haze: Haze = "none"
-    log_s: str = STRAYLIGHT.show(STRAYLIGHT.initial)
+    media_texts: dict[str, str] = field(
+        default_factory=lambda: initial_texts((STRAYLIGHT,))
+    )
     yellowing: Yellowing = "none"
 
     @property
@@ -391,7 +393,9 @@ class EyeForm:
         """Return the straylight and yellowing of the entries."""
         found: dict[str, Any] = {}
         if self.haze == "measured":
-            found["straylight"] = {STRAYLIGHT.name: STRAYLIGHT.read(self.log_s)}
+            found["straylight"] = {
+                STRAYLIGHT.name: STRAYLIGHT.read(self.media_texts[STRAYLIGHT.name])
+            }
         elif self.haze != "none":
             is_typical = self.haze == "age"
             found["straylight"] = {} if is_typical else {"cataract": self.haze}
@@ -506,7 +510,7 @@ class EyeForm:
             self.haze = light["cataract"]
         elif set(light) == {STRAYLIGHT.name}:
             self.haze = "measured"
-            self.log_s = STRAYLIGHT.show(light[STRAYLIGHT.name])
+            self.media_texts[STRAYLIGHT.name] = STRAYLIGHT.show(light[STRAYLIGHT.name])
         if self.haze != "none":
             del body["straylight"]
 

@@ -285,7 +285,7 @@ def _eye_entries(form: EyeForm) -> dict[str, Any]:
         "preset": form.preset,
         "higher_order": form.has_higher_order,
         "haze": form.haze,
-        "log_s": form.log_s,
+        "media": form.media_texts,
         "yellowing": form.yellowing,
         "texts": form.texts,
         "correction": entries if form.wears_correction else {},
@@ -397,7 +397,7 @@ def _restore_eye(form: EyeForm, entries: dict[str, Any]) -> list[str]:
         problems.append(f"preset {_short(entries['preset'])} is unknown")
     form.has_higher_order = entries.get("higher_order") is not False
     form.haze = _choice(entries, "haze", HAZES) or form.haze
-    form.log_s = str(entries.get("log_s", form.log_s))[:MAX_ENTRY_CHARACTERS]
+    problems += _restore_texts(form.media_texts, _mapping(entries, "media"))
     form.yellowing = _choice(entries, "yellowing", YELLOWINGS) or form.yellowing
     problems += _restore_texts(form.texts, _mapping(entries, "texts"))
     correction = _mapping(entries, "correction")

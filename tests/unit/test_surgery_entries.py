@@ -89,7 +89,8 @@ def test_a_link_of_version_0_2_keeps_its_meaning():
 def test_a_link_keeps_residual_haze_and_yellowing():
     state = PageState()
     form = state.eyes["OD"]
-    form.haze, form.log_s, form.yellowing = "measured", "1.40", "adapted"
+    form.haze, form.yellowing = "measured", "adapted"
+    form.media_texts["log_s"] = "1.40"
     form.wears_correction = True
     form.choose_worn("iol")
     form.worn.texts["residual_sphere_dpt"] = "-0.50"
@@ -148,7 +149,7 @@ def test_haze_that_the_entries_cannot_show_stays_in_the_profile():
 
 
 def test_a_wrong_straylight_is_said():
-    form = EyeForm("OD", haze="measured", log_s="9")
+    form = EyeForm("OD", haze="measured", media_texts={"log_s": "9"})
     with pytest.raises(ValueError, match=r"9 is out of range; allowed: 0\.5 to 2\.5"):
         form.body(age_years=AGE)
     assert form.haze_text(age_years=AGE) == ""
