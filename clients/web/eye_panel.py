@@ -15,14 +15,17 @@ from clients.web.controls import (
     PRESCRIPTION,
     SPHERE,
     SPHERE_SLIDER,
+    STRAYLIGHT,
     NumberField,
     prescription_texts,
 )
 from clients.web.eye_form import (
     DESIGNS,
     DISTANCE_KINDS,
+    HAZES,
     HINTS,
     SIDES,
+    YELLOWINGS,
     EyeForm,
     EyeSide,
     preset_titles,
@@ -31,6 +34,10 @@ from clients.web.widgets import SliderRow, select, title, toggle, upload_entry
 from estimator import MAX_PROFILE_BYTES, PROFILE_SUFFIXES
 
 SOURCES = {"prescription": "Prescription", "preset": "Preset", "file": "File"}
+
+NO_HIGHER_ORDER = (
+    "Without aberrations of the age: the prescription is that after lens surgery."
+)
 
 TYPING_MS = 400
 """Pause after which a typed number is used; an incomplete one would be another eye."""
@@ -80,13 +87,14 @@ class EyePanel:
             select(
                 preset_titles(),
                 form.preset,
-                self._takes(partial(setattr, form, "preset"), rebuilds=False),
+                self._takes(form.choose_preset),
                 label="Preset",
             ).classes("oc-wide").mark("preset")
         else:
             self._file()
         if form.loaded_name and form.source != "file":
             ui.label(f"Loaded: {form.loaded_name}").classes("oc-hint")
+        self._media()
         ui.separator()
         self._correction()
 
@@ -104,9 +112,14 @@ class EyePanel:
             sphere.on_value_change(lambda event: slider.show(_position(event.value)))
             for number in PRESCRIPTION[1:]:
                 self._entry(number, form.texts)
-        self._switch(
-            "Higher-order aberrations of this age", "has_higher_order", rebuilds=False
-        )
+        if form.applies_higher_order:
+            self._switch(
+                "Higher-order aberrations of this age",
+                "has_higher_order",
+                rebuilds=False,
+            )
+        else:
+            ui.label(NO_HIGHER_ORDER).classes("oc-hint")
 
     def _entry(
         self, number: NumberField, texts: dict[str, str], *, is_worn: bool = False
@@ -169,6 +182,23 @@ class EyePanel:
         ).classes("oc-wide").mark("profile-file")
         text = f"In use: {form.file_name}" if form.file_name else ""
         ui.label(text or f"A profile: {suffixes}").classes("oc-hint")
+
+    def _media(self) -> None:
+        """Show the entries of straylight and yellowing."""
+        form = self.form
+        with ui.element("div").classes("oc-fields"):
+            for options, name, label in (
+                (HAZES, "haze", "Straylight"),
+                (YELLOWINGS, "yellowing", "Yellowing"),
+            ):
+                select(
+                    options,
+                    getattr(form, name),
+                    self._takes(partial(setattr, form, name)),
+                    label=label,
+                ).classes("oc-wide").mark(name)
+            if form.haze == "measured":
+                self._entry(STRAYLIGHT, form.media_texts)
 
     def _correction(self) -> None:
         form, worn = self.form, self.form.worn
