@@ -27,6 +27,7 @@ from estimator.optics.zernike import remove_central_tilt, rescale_pupil, summed_
 from estimator.profiles import bodies
 from estimator.profiles.coefficients import measured_um, order_notes
 from estimator.profiles.common_fields import common_fields, prescription
+from estimator.profiles.correction_bodies import ContactLensBody, CorrectionBody
 from estimator.profiles.eye_profile import EYE_PUPIL_MM, EyeProfile, Measurement
 from estimator.profiles.surgery import Surgery
 from estimator.profiles.validation import KIND, convert
@@ -227,23 +228,21 @@ def _higher_order(
 
 
 def _behind_tear_film(
-    measurement: Measurement, correction: bodies.CorrectionBody | None
+    measurement: Measurement, correction: CorrectionBody | None
 ) -> Measurement:
     """Return a measurement behind the tear film of a rigid lens, if one is worn.
 
     All terms but C(2,0), which the power of the lens corrects, are smaller; tilt as
     well, so that the slope at the center stays zero.
     """
-    if not (isinstance(correction, bodies.ContactLensBody) and correction.rigid):
+    if not (isinstance(correction, ContactLensBody) and correction.rigid):
         return measurement
     zernike_um = measurement.zernike_um * TEAR_FILM_RATIO
     zernike_um[rx.C20] = measurement.zernike_um[rx.C20]
     return replace(measurement, zernike_um=zernike_um)
 
 
-def _primary(
-    correction: bodies.CorrectionBody | None, *given: Measurement
-) -> dict[str, Any]:
+def _primary(correction: CorrectionBody | None, *given: Measurement) -> dict[str, Any]:
     first, *others = (_behind_tear_film(m, correction) for m in given)
     radius_mm = first.pupil_diameter_mm / 2.0
     at_cornea_um = polynomial_in_mm(remove_central_tilt(first.zernike_um), radius_mm)
