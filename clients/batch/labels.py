@@ -8,17 +8,15 @@ from __future__ import annotations
 
 import csv
 import io
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from clients.batch.manifest import LABELS, Manifest, text_of
 from clients.batch.source import Constant, SourceFrame
 from clients.batch.work import LABEL_WAVELENGTH_NM, POWER_VECTOR
 from filter_service import FilterSettings
 from filter_service.atomic_files import write_atomically
-
-if TYPE_CHECKING:
-    from clients.batch.run import Batch
 
 COLUMNS = (
     "output",
@@ -40,18 +38,37 @@ of the row; J45 is in the frame of the eye.  Cells without a value are empty: of
 person, if none was drawn, and of the distance, if the image has depth."""
 
 
-def write_labels(batch: Batch, manifest: Manifest) -> None:
-    """Write the labels of all finished frames atomically, for their owner only."""
+def write_labels(
+    out: Path,
+    manifest: Manifest,
+    frames: Sequence[SourceFrame],
+    *,
+    settings: FilterSettings,
+    source: Path,
+) -> None:
+    """Write the labels of all finished frames atomically, for their owner only.
+
+    Parameters
+    ----------
+    out : Path
+        Output folder.
+    manifest : Manifest
+        Record of the finished frames.
+    frames : sequence of SourceFrame
+        Frames with eyes of their own.
+    settings : FilterSettings
+    source : Path
+        Folder of the frames, relative to which they are named.
+    """
     text = io.StringIO(newline="")
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(COLUMNS)
-    settings = batch.job.settings
-    for frame in batch.frames:
+    for frame in frames:
         assert frame.eye is not None
         record = manifest.record(frame.eye.name, frame.name)
         if record is not None and record["ok"]:
-            writer.writerow(_row(frame, record, settings, batch.source))
-    write_atomically(batch.out / LABELS, text.getvalue())
+            writer.writerow(_row(frame, record, settings, source))
+    write_atomically(out / LABELS, text.getvalue())
 
 
 def _row(

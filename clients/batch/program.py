@@ -10,11 +10,12 @@ from typing import Any
 
 import typer
 
+from clients.batch.description import batch_of
+from clients.batch.dry_run import dry_run, lines_of
 from clients.batch.manifest import Manifest
 from clients.batch.options import (
     BatchOptions,
     ImageSetOptions,
-    batch_of,
     workers_and_threads,
 )
 from clients.batch.pools import THREADS_VARIABLE, ProcessPool, RayPool
@@ -23,8 +24,6 @@ from clients.batch.run import (
     begin_anew,
     check_folder,
     check_links,
-    dry_run,
-    lines_of,
     only_one,
     run_batch,
 )
@@ -58,8 +57,12 @@ def run(options: BatchOptions, *, quiet: bool) -> dict[str, Any]:
     batch = batch_of(options)
     if options.dry_run:
         os.environ[THREADS_VARIABLE] = "1"
-        price = options.price_per_core_hour
-        return dry_run(batch, n_cores=n_workers * n_threads, price_per_core_hour=price)
+        return dry_run(
+            batch,
+            n_workers=n_workers,
+            n_threads=n_threads,
+            price_per_core_hour=options.price_per_core_hour,
+        )
     check_folder(batch.out)
     with only_one(batch.out) as lock:
         check_links(batch)

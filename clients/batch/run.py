@@ -1,19 +1,12 @@
-"""Run of a batch: processes the missing frames and returns a summary.
-
-`dry_run` estimates the time, and the cost of a million images: it filters the first
-frames on one core and discards the images.
-"""
+"""Run of a batch: processes the missing frames and returns a summary."""
 
 from __future__ import annotations
 
 import fcntl
-import math
 import os
 import re
 import sys
-import tempfile
 import time
-from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, contextmanager, suppress
@@ -22,8 +15,6 @@ from datetime import UTC, datetime
 from functools import cache, cached_property, partial
 from pathlib import Path
 from typing import Any, cast
-
-import numpy as np
 
 from clients.batch.labels import write_labels
 from clients.batch.manifest import (
@@ -44,8 +35,7 @@ from clients.batch.manifest import (
 )
 from clients.batch.pools import ProcessPool, RayPool
 from clients.batch.source import SourceFrame
-from clients.batch.work import EYES_FOLDER, Job, Unit, UnitRunner
-from clients.frame_log import Notes, add_notes, note_line
+from clients.batch.work import EYES_FOLDER, Job, Unit
 from estimator import InvalidFile, thread_count
 
 UNIT_FRAMES = 16
@@ -67,12 +57,6 @@ LOCK_WAIT_S = 3.0
 
 _CHECKED_AT_ONCE = 1000
 _SEGMENT_NAME = re.compile(r"\d{8}\.mkv")
-
-MEASURED_FRAMES = 6
-"""Frames per profile, of which the first one is a warm-up."""
-
-SECONDS_PER_HOUR = 3600.0
-MILLION = 1_000_000
 
 
 @dataclass(frozen=True)
@@ -402,7 +386,10 @@ def run_batch(
     if batch.job.is_video:
         _join_videos(batch, manifest)
     if batch.has_own_eyes:
-        write_labels(batch, manifest)
+        settings, source = batch.job.settings, batch.source
+        write_labels(
+            batch.out, manifest, batch.frames, settings=settings, source=source
+        )
     manifest.check_in_place()
     took_s = time.monotonic() - started_s
     summary = {
@@ -461,114 +448,3 @@ def _join_videos(batch: Batch, manifest: Manifest) -> None:
         manifest.append(
             {"kind": "video", "profile": profile, "file": target.name, **content}
         )
-
-
-def dry_run(
-    batch: Batch, *, n_cores: int, price_per_core_hour: float | None
-) -> dict[str, Any]:
-    """Return the report of `ocufilter batch --dry-run`."""
-    n_all = batch.count
-    n_missing = n_all
-    if (batch.out / LINES).is_file():
-        job = batch.described()
-        with Manifest(batch.out, job, read_only=True) as manifest:
-            units = missing_units(batch, manifest)
-        n_missing = sum(len(unit.frames) for unit in units)
-    measured = [_measured(batch, profile) for profile in batch.job.profiles]
-    ms = [one["ms_per_frame"] for one in measured if one["ms_per_frame"] is not None]
-    mean_ms = float(np.mean(ms)) if ms else math.nan
-    sizes = [one["bytes_per_frame"] for one in measured if one["bytes_per_frame"]]
-    # A helper process of each worker computes the PSFs, once per profile.
-    builds_s = sum(one["build_s"] for one in measured) if n_missing else 0.0
-    core_hours = mean_ms * MILLION / 1e3 / SECONDS_PER_HOUR
-    report = {
-        "layout": batch.layout,
-        "frames": len(batch.frames),
-        "profiles": measured,
-        "pictures": n_all,
-        "pictures_missing": n_missing,
-        "cores": n_cores,
-        "ms_per_picture_and_core": _known(mean_ms, 2),
-        "seconds": _known(n_missing * mean_ms / 1e3 / n_cores + builds_s, 1),
-        "output_mb": _known(n_missing * float(np.mean(sizes)) / 1e6, 1)
-        if sizes
-        else None,
-        "core_hours_per_million": _known(core_hours, 2),
-    }
-    if price_per_core_hour is not None:
-        report["price_per_million"] = _known(core_hours * price_per_core_hour, 2)
-    return report
-
-
-def _known(value: float, digits: int) -> float | None:
-    return round(value, digits) if math.isfinite(value) else None
-
-
-def _measured(batch: Batch, profile: str) -> dict[str, Any]:
-    """Filter the first frames through a profile, on one thread."""
-    times_ms, sizes, errors = [], [], []
-    notes: Notes = {}
-    with (
-        tempfile.TemporaryDirectory(prefix="ocufilter-dry-run-") as folder,
-        closing(UnitRunner(batch.job, Path(folder))) as runner,
-    ):
-        for number, frame in enumerate(batch.frames[:MEASURED_FRAMES]):
-            segment = Path(f"{number}.mkv") if batch.job.is_video else None
-            started_s = time.perf_counter()
-            (record,) = runner.run(Unit(number, profile, (frame,), segment))
-            took_ms = 1e3 * (time.perf_counter() - started_s)
-            if not record["ok"]:
-                errors.append(record["error"])
-                continue
-            add_notes(notes, record["notes"])
-            sizes.append(record["bytes"])
-            if "build" not in record["ms"]:
-                times_ms.append(took_ms)
-    return {
-        "profile": profile,
-        "measured_frames": len(times_ms),
-        "build_s": round(runner.build_s, 2),
-        "ms_per_frame": round(float(np.median(times_ms)), 2) if times_ms else None,
-        "bytes_per_frame": round(float(np.mean(sizes))) if sizes else None,
-        "errors": errors,
-        "notes": list(notes.values()),
-    }
-
-
-def lines_of(report: dict[str, Any], price_per_core_hour: float | None) -> list[str]:
-    """Format the report as lines of text."""
-    lines = [
-        f"{report['frames']} frames of the layout {report['layout']}, "
-        f"{len(report['profiles'])} profiles: {report['pictures']} images, "
-        f"{report['pictures_missing']} of them missing"
-    ]
-    for one in report["profiles"]:
-        took = one["ms_per_frame"]
-        measured = (
-            "no frame was measured"
-            if took is None
-            else f"{took:.1f} ms per frame on one core ({one['measured_frames']} "
-            f"measured), {one['bytes_per_frame'] / 1e6:.2f} MB"
-        )
-        lines.append(f"  {one['profile']}: {measured}; PSFs {one['build_s']:.1f} s")
-        for text, count in Counter(one["errors"]).items():
-            times = f" ({count} of {MEASURED_FRAMES} frames)" if count > 1 else ""
-            lines.append(f"    error: {text}{times}")
-        lines += [f"    note: {note_line(note)}" for note in one["notes"]]
-    if report["seconds"] is not None:
-        lines.append(
-            f"about {_duration(report['seconds'])} on {report['cores']} cores, "
-            f"{report['output_mb']:g} MB"
-        )
-        cost = f"a million images: {report['core_hours_per_million']:g} core-hours"
-        if price_per_core_hour is not None:
-            cost += f", {report['price_per_million']:g} at {price_per_core_hour:g} each"
-        lines.append(cost)
-    return lines
-
-
-def _duration(seconds: float) -> str:
-    if seconds < 120.0:
-        return f"{seconds:.0f} s"
-    minutes = seconds / 60.0
-    return f"{minutes:.0f} min" if minutes < 120.0 else f"{minutes / 60.0:.1f} h"

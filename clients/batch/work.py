@@ -241,7 +241,7 @@ class UnitRunner:
         folder = profile if frame.eye is None else EYES_FOLDER
         file = Path(folder) / f"{frame.name}.{self._job.format}"
         try:
-            color, grid, record = self._filtered(profile, frame)
+            color, grid, record = self.filtered(profile, frame)
             start_s = time.perf_counter()
             metadata = picture_metadata(
                 self._job.made_by,
@@ -300,7 +300,7 @@ class UnitRunner:
                     raise Cancelled
                 cpu_s = time.process_time()
                 try:
-                    image, grid, record = self._filtered(unit.profile, frame)
+                    image, grid, record = self.filtered(unit.profile, frame)
                     shape = shape or image.shape
                     if image.shape != shape:
                         raise BadFrame("its size differs")
@@ -347,7 +347,7 @@ class UnitRunner:
             )
         return path
 
-    def _filtered(
+    def filtered(
         self, profile: str, frame: SourceFrame
     ) -> tuple[NDArray[Any], PixelGrid, Record]:
         """Return a filtered frame, the place of its pixels, and its record."""
@@ -409,8 +409,9 @@ class UnitRunner:
             profile, age_years = eye.profile, self._job.settings.age_years
             if age_years is not None:
                 profile = replace(profile, age_years=age_years)
-            quality = Eye(profile)
-            self._quality = eye.name, quality
+            self._quality = eye.name, Eye(profile)
+        quality = self._quality[1]
+        assert quality is not None
         try:
             found = quality.refraction(
                 pupil_diameter_mm=pupil_mm, wavelength_nm=LABEL_WAVELENGTH_NM
@@ -422,20 +423,34 @@ class UnitRunner:
         values = dict(zip(found.coords["quantity"].tolist(), found.values, strict=True))
         return {name: round(float(values[name]), 5) for name in POWER_VECTOR}
 
+    def open(self, *, has_own_eyes: bool) -> EyeFilter:
+        """Return the filter, which is opened by the first call.
+
+        Parameters
+        ----------
+        has_own_eyes : bool
+            Whether frames have eyes of their own: an eye of few images takes less time
+            without a process that builds eyes.
+
+        Raises
+        ------
+        EngineUnusable
+        """
+        try:
+            self._open = self._open or EyeFilter(
+                engine=self._job.engine, worker=not has_own_eyes
+            )
+        except FilterError as error:
+            raise EngineUnusable(str(error)) from None
+        return self._open
+
     def _prepared(self, profile: str, frame: SourceFrame, camera: Camera) -> EyeFilter:
         """Return the filter, prepared for a profile and for exactly a camera.
 
         With an eye prepared for similar cameras, images would depend on which camera
         came first.
         """
-        eye = frame.eye
-        try:
-            # An eye of few images takes less time without a process of its own.
-            self._open = found = self._open or EyeFilter(
-                engine=self._job.engine, worker=eye is None
-            )
-        except FilterError as error:
-            raise EngineUnusable(str(error)) from None
+        eye, found = frame.eye, self.open(has_own_eyes=frame.eye is not None)
         if self._key != (profile, camera):
             self._key = None
             for _ in range(ATTEMPTS):

@@ -64,7 +64,7 @@ def bank(
 
     ocufilter bank people -p me.json --people 200 --fov-deg 20
     """
-    from clients.batch.options import drawn_people, read_profiles
+    from clients.batch.profiles import drawn_people, read_profiles
     from filter_service import Camera, EyeBank
 
     check_range("--fov-deg", fov_deg, FOV_LIMITS_DEG)

@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from clients.batch.layouts import list_frames
-from clients.batch.options import drawn_people
+from clients.batch.profiles import drawn_people
 from clients.batch.source import Constant, FieldOfView, SourceFrame, States
 from clients.batch.views import Views
 from clients.batch.work import batch_settings
