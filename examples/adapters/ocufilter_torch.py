@@ -3,11 +3,17 @@
     transform = SeenThrough("myopia", vertical_fov_deg=40.0, distance_m=2.0)
     data_set = torchvision.datasets.ImageFolder("letters", transform=transform)
 
-The transform accepts a PIL image, an array [row, column, channel] or a tensor [...,
-channel, row, column], with sRGB values as bytes or as floats from 0 to 1, and returns
-the same kind.  Pass a tuple (image, depth in meters) to replace the constant distance.
-Gradients pass through tensors of floats.  Each `DataLoader` worker creates its own eye
-for its first image, which takes a second or two.
+The transform accepts a PIL image, an array [..., row, column, channel] or a tensor
+[..., channel, row, column], with sRGB values as bytes or as floats from 0 to 1, and
+returns the same kind.  Gray images have one channel or none: [row, column].  Pass a
+tuple (image, depth in meters) to replace the constant distance.  Gradients pass through
+tensors of floats.  Each `DataLoader` worker creates its own eye for its first image,
+which takes up to a second.
+
+Another eye, pupil or focus for one image, or a sequence of them for a batch [image,
+...], are arguments of the call:
+
+    transform(image, profile=bank[number], pupil_diameter_mm=3.5)
 """
 
 import numpy as np
@@ -18,7 +24,7 @@ from ocufilter.torch import SeeThrough
 
 
 class SeenThrough:
-    """Filter images through one eye.
+    """Filter images through an eye.
 
     Parameters
     ----------
@@ -44,30 +50,46 @@ class SeenThrough:
         focus_dpt=0.0,
         settings=None,
     ):
-        self.profile = profile
         self.vertical_fov_deg, self.distance_m = vertical_fov_deg, distance_m
-        self.options = {
+        self.settings = settings or {}
+        self.eye = {
+            "profile": profile,
             "pupil_diameter_mm": pupil_diameter_mm,
             "focus_dpt": focus_dpt,
-            "settings": settings or {},
         }
         self._layers = {}
 
-    def __call__(self, picture):
-        """Return the filtered image, of the same type as the input."""
+    def __call__(self, picture, **eye):
+        """Return the filtered image, of the same type as the input.
+
+        Parameters
+        ----------
+        picture : PIL image, array or tensor, or (picture, depth in meters)
+        **eye
+            ``profile``, ``pupil_diameter_mm`` or ``focus_dpt`` of this call.
+        """
         picture, depth_m = picture if isinstance(picture, tuple) else (picture, None)
         if isinstance(picture, torch.Tensor):
-            return self._seen(picture, depth_m)
-        color = torch.from_numpy(np.array(picture)).movedim(-1, -3)
-        seen = self._seen(color, depth_m).movedim(-3, -1).contiguous().numpy()
+            return self._seen(picture, depth_m, eye)
+        color = torch.from_numpy(np.array(picture))
+        if color.ndim > 2:
+            color = color.movedim(-1, -3)
+        seen = self._seen(color, depth_m, eye)
+        if color.ndim > 2:
+            seen = seen.movedim(-3, -1)
+        seen = seen.contiguous().numpy()
         if isinstance(picture, np.ndarray):
             return seen
         from PIL import Image
 
         return Image.fromarray(seen)
 
-    def _seen(self, color, depth_m):
+    def _seen(self, color, depth_m, eye):
         layer, distance_m = self._layer_of(*color.shape[-2:])
+        for name, value in (self.eye | eye).items():
+            if name not in self.eye:
+                raise TypeError(f"unknown {name!r}; expected one of: {[*self.eye]}")
+            setattr(layer, name, value)
         layer.depth_m = distance_m if depth_m is None else np.float32(depth_m)
         if color.dtype != torch.uint8:
             return encoded(layer(decoded(color)))
@@ -82,7 +104,9 @@ class SeenThrough:
                 self.vertical_fov_deg, width_px=width_px, height_px=height_px
             )
             depth_m = np.full(size, self.distance_m, np.float32)
-            layer = SeeThrough(self.profile, camera, depth_m, **self.options)
+            layer = SeeThrough(
+                camera=camera, depth_m=depth_m, settings=self.settings, **self.eye
+            )
             self._layers[size] = layer, depth_m
         return self._layers[size]
 

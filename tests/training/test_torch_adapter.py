@@ -68,6 +68,44 @@ def test_it_takes_floats_as_srgb(transform, color):
     assert difference(255.0 * seen, expected(color)) < 0.51 + 1e-2
 
 
+def test_it_takes_gray_pictures(transform, color):
+    gray = color[..., 0]
+    seen = transform(gray)
+    assert (seen.shape, seen.dtype) == (gray.shape, np.uint8)
+    linear = decoded(expected(np.repeat(gray[..., None], 3, axis=2)) / 255.0)
+    wanted = encoded(linear @ np.array([0.2126, 0.7152, 0.0722]))
+    assert difference(seen, 255.0 * wanted) < 2.0  # both are rounded to bytes
+    assert difference(seen, gray) > 50
+    picture = transform(Image.fromarray(gray))
+    assert picture.mode == "L"
+    np.testing.assert_array_equal(np.asarray(picture), seen)
+    np.testing.assert_array_equal(transform(gray[None, :, :, None])[0, :, :, 0], seen)
+    batch = torch.from_numpy(gray)[None, None]
+    np.testing.assert_array_equal(transform(batch)[0, 0].numpy(), seen)
+
+
+def decoded(srgb):
+    return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+
+
+def encoded(linear):
+    curve = 1.055 * np.maximum(linear, 0.0031308) ** (1.0 / 2.4) - 0.055
+    return np.where(linear <= 0.0031308, 12.92 * linear, curve)
+
+
+def test_each_picture_may_have_an_eye_of_its_own(transform, color):
+    eye = {"profile": "emmetropia", "focus_dpt": 0.5}
+    own, usual = transform(color, **eye), transform(color)
+    assert difference(own, usual) > 20
+    eyes = {"profile": ["myopia", "emmetropia"], "focus_dpt": [0.0, 0.5]}
+    both = transform(np.stack([color, color]), **eyes)
+    np.testing.assert_array_equal(both, [usual, own])
+    with pytest.raises(TypeError, match="unknown 'pupil'; expected one of: "):
+        transform(color, pupil=3.0)
+    with pytest.raises(ValueError, match=r"samples\[1\].focus_dpt: it is -1"):
+        transform(np.stack([color, color]), focus_dpt=[0.0, -1.0])
+
+
 def test_it_needs_no_settings(transform, color):
     usual = type(transform)("myopia", vertical_fov_deg=20.0, distance_m=2.0)
     assert usual(color).shape == color.shape
