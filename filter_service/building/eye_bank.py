@@ -271,9 +271,8 @@ class EyeBank(Sequence[BankedEye]):
     """A bank of prebuilt eyes, a sequence of profiles for `EyeFilter`.
 
     An eye of a bank needs no estimation and no computation of PSFs: a filter maps its
-    file.  Images have the same bytes as without the bank; through multifocal lenses,
-    they may differ by a step of 8 bits, as with the setting ``prepare="ranges"``.  The
-    files contain medical data, and only their owner can read them.
+    file.  Images have the same bytes as without the bank.  The files contain medical
+    data, and only their owner can read them.
 
     Parameters
     ----------

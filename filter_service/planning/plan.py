@@ -397,6 +397,12 @@ class NodePlanner:
             wavefronts=wavefronts,
         )
 
+    @cached_property
+    def widest_pupils(self) -> NodeWavefronts:
+        """Wavefronts of the field nodes through the widest pupil."""
+        groups = self._groups(-1, 0)
+        return NodeWavefronts.of(self.eye, self.spec, groups, self._wavefronts_of)
+
     def _groups(self, pupil: int, accommodation: int) -> PupilStates:
         """Return the field nodes of a state, in green light without defocus."""
         h_deg, v_deg = self.axes.field_nodes_deg

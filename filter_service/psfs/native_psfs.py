@@ -56,16 +56,21 @@ class NodeRings:
     lattice_mm: tuple[float, float, float]
 
     @classmethod
-    def of(cls, rings: Rings, wavefronts: NodeWavefronts) -> NodeRings:
-        """Tabulate a lens for the pupils of groups."""
-        seen = rings.seen_from(wavefronts.h_deg, wavefronts.v_deg)
-        center_mm = np.broadcast_to(seen.centre_mm, (wavefronts.h_deg.size, 2))
-        ellipse = wavefronts.pupil_ellipse
-        offset_mm = ellipse[..., :2] - center_mm[:, None, None]
-        largest_mm = ellipse[..., 2] + np.linalg.norm(offset_mm, axis=-1)
+    def of(
+        cls, rings: Rings, wavefronts: NodeWavefronts, widest: NodeWavefronts
+    ) -> NodeRings:
+        """Tabulate a lens for the pupils of groups.
+
+        Parameters
+        ----------
+        widest : NodeWavefronts
+            The same directions through the widest pupil, over which tables extend:
+            images must not depend on the groups that were planned before.
+        """
+        seen, offset_mm, largest_mm = _seen_rings(rings, wavefronts)
         lattice_mm = ONE_CENTER if seen.lattice_mm is None else seen.lattice_mm
         if seen.lattice_mm is None:
-            radius_mm = float(BEYOND_EDGE * largest_mm.max())
+            radius_mm = float(BEYOND_EDGE * _seen_rings(rings, widest)[2].max())
         else:
             radius_mm = seen.lattice_mm[0]
         square_mm2 = (np.arange(TABLE_COUNT) + 0.5) / TABLE_COUNT * radius_mm**2
@@ -76,6 +81,17 @@ class NodeRings:
             field = seen.transmission(square_mm2, float(nm))
             tables[place] = np.stack([field.real, field.imag], axis=-1)
         return cls(offset_mm, reach_mrad, tables, float(radius_mm), lattice_mm)
+
+
+def _seen_rings(
+    rings: Rings, wavefronts: NodeWavefronts
+) -> tuple[Rings, NDArray[np.float64], NDArray[np.float64]]:
+    """Return a lens as groups see it, offsets of pupils, and their largest radius."""
+    seen = rings.seen_from(wavefronts.h_deg, wavefronts.v_deg)
+    center_mm = np.broadcast_to(seen.centre_mm, (wavefronts.h_deg.size, 2))
+    ellipse = wavefronts.pupil_ellipse
+    offset_mm = ellipse[..., :2] - center_mm[:, None, None]
+    return seen, offset_mm, ellipse[..., 2] + np.linalg.norm(offset_mm, axis=-1)
 
 
 @dataclass(frozen=True)

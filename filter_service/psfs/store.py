@@ -367,7 +367,8 @@ class PsfStore:
         if self.eye.rings is None:
             return None
         if self._rings is None or self._rings[0] is not nodes:
-            self._rings = nodes, NodeRings.of(self.eye.rings, nodes.wavefronts)
+            widest = self._planner.widest_pupils
+            self._rings = nodes, NodeRings.of(self.eye.rings, nodes.wavefronts, widest)
         return self._rings[1]
 
     @contextmanager

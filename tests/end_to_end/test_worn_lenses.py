@@ -84,6 +84,43 @@ def test_a_point_is_seen_through_all_foci(by):
             assert error < limit * expected.max(), object_dpt
 
 
+@pytest.mark.long("an eye with two foci is built three times")
+def test_a_frame_through_two_foci_does_not_depend_on_earlier_ones():
+    """Nor on preparation: tables of the lens once ended at the widest pupil so far."""
+    color = np.random.default_rng(2).random((24, 32, 3)).astype(np.float32)
+    depth_m = np.full((24, 32), 0.5, np.float32)
+    camera = Camera.from_fov(3.0, width_px=32, height_px=24)
+    pupils_mm = [3.1, 4.9]
+
+    def images(prepare, order):
+        settings = {
+            "mode": "on-axis",
+            "eye_model": "wavefront",
+            "prepare": prepare,
+            "focus_range_dpt": (0.0, 0.0),
+            "object_range_dpt": (1.9, 2.1),
+            "pupil_range_mm": (3.0, 5.0),
+        }
+        with EyeFilter(BIFOCAL, camera, settings, engine="native") as eye_filter:
+            found = [
+                eye_filter.filter(
+                    *(color, depth_m),
+                    pupil_diameter_mm=pupil_mm,
+                    focus_dpt=0.0,
+                    output="linear",
+                    whole=True,
+                ).color
+                for pupil_mm in pupils_mm[::order]
+            ]
+        return found[::order]
+
+    with EyeFilter(engine="native"):  # keeps the build worker
+        expected = images("stream", 1)
+        for found in (images("stream", -1), images("ranges", 1)):
+            for one, other in zip(found, expected, strict=True):
+                assert np.array_equal(one, other)
+
+
 def test_far_and_near_are_both_sharp(tmp_path, capsys):
     """`ocufilter psf`: a monofocal lens has one focus, a bifocal one two."""
     peaks = {}

@@ -380,7 +380,8 @@ def test_pupils_behind_rings_are_those_of_the_python_engine(lens):
     rings = LENSES[lens]
     rng = np.random.default_rng(7)
     wavefronts = wavefronts_of(random_zernike(rng, 3, 0.8), pupil_mm=4.5)
-    ours, methods, left = computed(wavefronts, rings=NodeRings.of(rings, wavefronts))
+    tables = NodeRings.of(rings, wavefronts, wavefronts)
+    ours, methods, left = computed(wavefronts, rings=tables)
     assert not left.size
     assert methods == {"fourier": 9}
     theirs = twin(wavefronts, rings=rings)
