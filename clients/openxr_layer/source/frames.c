@@ -1,10 +1,12 @@
-/* Frames on their way to the helper and back, and the layers that show them. */
 #include <stdlib.h>
 #include <string.h>
 
-#include "layer.h"
+#include "frames.h"
+#include "gaze.h"
+#include "graphics.h"
 #include "log.h"
 
+#define MAX_LAYERS 64
 #define NS_PER_MS UINT64_C(1000000)
 #define MAX_RESULTS 4
 #define ALIGN(bytes) (((bytes) + 63) & ~(size_t)63)
@@ -29,6 +31,12 @@ static bool is_inside(const swapchain *chain, const XrSwapchainSubImage *part) {
            part->imageArrayIndex < chain->info.arraySize;
 }
 
+static bool is_color(const swapchain *chain) { return chain->format && chain->format->wire; }
+
+static bool is_depth(const swapchain *chain) {
+    return chain->format && !chain->format->wire;
+}
+
 static const XrCompositionLayerDepthInfoKHR *depth_of(const void *next) {
     for (const XrBaseInStructure *at = next; at; at = at->next)
         if (at->type == XR_TYPE_COMPOSITION_LAYER_DEPTH_INFO_KHR)
@@ -47,12 +55,11 @@ static bool plan_views(session *at, plan *p) {
     for (int eye = 0; eye < WIRE_EYES; ++eye) {
         const XrCompositionLayerProjectionView *view = p->layer->views + eye;
         const swapchain *color = p->color[eye];
-        if (!swapchain_can_copy(color) || is_depth_format(color->info.format) ||
-            color->info.format != p->color[0]->info.format) {
+        if (!is_color(color) || color->format != p->color[0]->format) {
             LOG_ONCE(&at->reported, REASON_FORMAT,
-                     "images of format 0x%llx are not filtered; supported: SRGB8_ALPHA8, "
-                     "RGBA8, RGB10_A2, RGBA16, RGBA16F, the same for both eyes",
-                     (long long)color->info.format);
+                     "images of format 0x%llx are not filtered; supported: %s, the same "
+                     "for both eyes",
+                     (long long)color->info.format, at->api->formats);
             return false;
         }
         if (!is_inside(color, &view->subImage)) {
@@ -64,7 +71,7 @@ static bool plan_views(session *at, plan *p) {
         swapchain *depth = info ? find_swapchain(info->subImage.swapchain) : NULL;
         if (!depth || depth->session != at) continue;
         depth->unused_releases = 0;
-        if (!is_depth_format(depth->info.format) || !depth->has_copy ||
+        if (!is_depth(depth) || !depth->has_copy ||
             !is_inside(depth, &info->subImage))
             continue;
         p->depth[eye] = depth;
@@ -161,10 +168,12 @@ static size_t describe(session *at, const plan *p, const XrFrameEndInfo *info) {
                          .space = p->space,
                          .flags = p->layer->layerFlags,
                          .format = p->color[0]->info.format};
+    const image_format *format = p->color[0]->format;
     *wire = (wire_frame){.kind = WIRE_FRAME,
                          .frame_id = at->next_frame++,
                          .display_time_ns = info->displayTime,
-                         .color_format = wire_format_of(frame->format)};
+                         .flags = format->flags,
+                         .color_format = format->wire};
     if (frame->flags & XR_COMPOSITION_LAYER_BLEND_TEXTURE_SOURCE_ALPHA_BIT)
         wire->flags |= WIRE_IS_BLENDED;
     size_t bytes = 0, pixel = wire->color_format == WIRE_LINEAR16F ? 8 : 4;
@@ -203,36 +212,19 @@ static bool begin_frame(session *at, const plan *p, const XrFrameEndInfo *info) 
     return true;
 }
 
-/* Begin to read the copies of a frame, in the layer's context. */
-static void read_images(session *at, const plan *p) {
-    gl_context *gl = &at->gl;
-    uint8_t *base = at->link.memory;
-    if (!gl->is_software) {
-        /* A buffer is read without waiting for the GPU. */
-        if (at->is_read) gl->DeleteSync(at->is_read); /* of a helper that has ended */
-        if (!at->pixels) gl->GenBuffers(1, &at->pixels);
-        gl->BindBuffer(GL_PIXEL_PACK_BUFFER, at->pixels);
-        if (at->pixels_bytes != at->link.memory_bytes) {
-            at->pixels_bytes = at->link.memory_bytes;
-            gl->BufferData(GL_PIXEL_PACK_BUFFER, (GLsizeiptr)at->pixels_bytes, NULL,
-                           GL_STREAM_READ);
-        }
-        base = NULL;
-    }
+/* Begin to read the copies of a frame. */
+static read_state read_images(session *at, const plan *p) {
+    image_read reads[2 * WIRE_EYES];
+    size_t count = 0;
     for (int eye = 0; eye < WIRE_EYES; ++eye) {
         const wire_view *view = at->frame.wire.views + eye;
-        swapchain_read(p->color[eye], &p->layer->views[eye].subImage,
-                       at->frame.wire.color_format, base + view->color.start);
+        reads[count++] = (image_read){p->color[eye], &p->layer->views[eye].subImage,
+                                      view->color.start};
         if (p->depth[eye])
-            swapchain_read(p->depth[eye], &p->depth_info[eye]->subImage, 0,
-                           base + view->depth.start);
+            reads[count++] = (image_read){p->depth[eye], &p->depth_info[eye]->subImage,
+                                          view->depth.start};
     }
-    if (!gl->is_software) {
-        gl->BindBuffer(GL_PIXEL_PACK_BUFFER, 0);
-        at->is_read = gl->FenceSync(GL_SYNC_GPU_COMMANDS_COMPLETE, 0);
-        gl->Flush();
-    }
-    at->frame.state = FRAME_READING;
+    return at->api->begin_read(at, reads, count);
 }
 
 static void clear_counts(session *at) {
@@ -240,27 +232,7 @@ static void clear_counts(session *at) {
     at->copy_ns = at->read_ns = at->upload_ns = at->other_ns = 0;
 }
 
-/* Copy the buffer that has been read; false if the GPU has not finished. */
-static bool take_buffer(session *at, uint64_t limit_ns) {
-    gl_context *gl = &at->gl;
-    if (gl->ClientWaitSync(at->is_read, GL_SYNC_FLUSH_COMMANDS_BIT, limit_ns) ==
-        GL_TIMEOUT_EXPIRED)
-        return false;
-    gl->DeleteSync(at->is_read);
-    at->is_read = NULL;
-    gl->BindBuffer(GL_PIXEL_PACK_BUFFER, at->pixels);
-    const void *found = gl->MapBufferRange(GL_PIXEL_PACK_BUFFER, 0,
-                                           (GLsizeiptr)at->pixels_bytes, GL_MAP_READ_BIT);
-    if (found) memcpy(at->link.memory, found, at->pixels_bytes);
-    else at->frame.state = FRAME_NONE;
-    gl->UnmapBuffer(GL_PIXEL_PACK_BUFFER);
-    gl->BindBuffer(GL_PIXEL_PACK_BUFFER, 0);
-    return found != NULL;
-}
-
-/* Send the frame if its images have been read, in the layer's context. */
-static void send_frame(session *at, uint64_t limit_ns) {
-    if (!at->gl.is_software && !take_buffer(at, limit_ns)) return;
+static void send_frame(session *at) {
     wire_frame *wire = &at->frame.wire;
     wire->frames = at->frames;
     wire->frames_filtered = at->frames_filtered;
@@ -293,156 +265,39 @@ static void receive(session *at) {
     clear_counts(at);
 }
 
-/* Before xrDestroySwapchain, all commands that refer to its images must have completed. */
-static void finish_uploads(session *at) {
-    gl_current before;
-    if (!gl_enter(&at->gl, &before)) return;
-    at->gl.Finish();
-    gl_leave(&at->gl, &before, false);
-}
-
-static void destroy_image(session *at, own_image *image) {
-    if (image->handle) at->instance->DestroySwapchain(image->handle);
-    *image = (own_image){0};
-}
-
-static bool fill_image(session *at, own_image *image) {
-    XrSwapchainCreateInfo info = {.type = XR_TYPE_SWAPCHAIN_CREATE_INFO,
-                                  .usageFlags = XR_SWAPCHAIN_USAGE_COLOR_ATTACHMENT_BIT |
-                                                XR_SWAPCHAIN_USAGE_SAMPLED_BIT |
-                                                XR_SWAPCHAIN_USAGE_TRANSFER_DST_BIT,
-                                  .format = image->format,
-                                  .sampleCount = 1,
-                                  .width = image->width_px,
-                                  .height = image->height_px,
-                                  .faceCount = 1,
-                                  .arraySize = 1,
-                                  .mipCount = 1};
-    if (XR_FAILED(at->instance->CreateSwapchain(at->handle, &info, &image->handle))) {
-        image->handle = XR_NULL_HANDLE;
-        return false;
-    }
-    XrSwapchainImageOpenGLKHR found[MAX_IMAGES];
-    for (int i = 0; i < MAX_IMAGES; ++i)
-        found[i] = (XrSwapchainImageOpenGLKHR){.type = XR_TYPE_SWAPCHAIN_IMAGE_OPENGL_KHR};
-    if (XR_FAILED(at->instance->EnumerateSwapchainImages(
-            image->handle, MAX_IMAGES, &image->image_count,
-            (XrSwapchainImageBaseHeader *)found)))
-        return false;
-    for (uint32_t i = 0; i < image->image_count; ++i) image->images[i] = found[i].image;
-    return true;
-}
-
-static bool create_image(session *at, own_image *image, const wire_image *color) {
-    bool is_same_format = image->handle && image->format == at->frame.format;
-    if (is_same_format && image->width_px >= color->width_px &&
-        image->height_px >= color->height_px)
-        return true;
-    /* Sizes that change with the frame rate must not create a swapchain per frame. */
-    uint32_t width_px = color->width_px, height_px = color->height_px;
-    if (is_same_format && width_px < image->width_px) width_px = image->width_px;
-    if (is_same_format && height_px < image->height_px) height_px = image->height_px;
-    at->is_shown = false; /* a new swapchain has no image yet */
-    if (image->handle) finish_uploads(at);
-    destroy_image(at, image);
-    image->format = at->frame.format;
-    image->width_px = width_px;
-    image->height_px = height_px;
-    if (fill_image(at, image)) return true;
-    destroy_image(at, image);
-    return false;
-}
-
-/* Acquire an image of the layer's own for each eye; false if the runtime still reads it. */
-static bool acquire_images(session *at) {
-    for (int eye = 0; eye < WIRE_EYES; ++eye) {
-        own_image *image = at->images + eye;
-        if (!create_image(at, image, &at->frame.wire.views[eye].color)) {
-            LOG_ONCE(&at->reported, REASON_SWAPCHAIN,
-                     "the runtime provides no swapchain for filtered images");
-            at->frame.state = FRAME_NONE; /* try again with the next result */
-            return false;
-        }
-        if (!image->is_acquired)
-            image->is_acquired = XR_SUCCEEDED(
-                at->instance->AcquireSwapchainImage(image->handle, NULL, &image->index));
-        const XrSwapchainImageWaitInfo at_once = {.type = XR_TYPE_SWAPCHAIN_IMAGE_WAIT_INFO,
-                                                  .timeout = 0};
-        if (image->is_acquired && !image->is_waited)
-            image->is_waited =
-                at->instance->WaitSwapchainImage(image->handle, &at_once) == XR_SUCCESS;
-        if (!image->is_waited) return false;
-    }
-    return true;
-}
-
-static bool upload_images(session *at) {
-    gl_context *gl = &at->gl;
-    const wire_frame *wire = &at->frame.wire;
-    GLenum type = wire->color_format == WIRE_LINEAR16F ? GL_HALF_FLOAT : GL_UNSIGNED_BYTE;
-    for (int eye = 0; eye < WIRE_EYES; ++eye) {
-        const own_image *image = at->images + eye;
-        const wire_image *color = &wire->views[eye].color;
-        gl->BindTexture(GL_TEXTURE_2D, image->images[image->index]);
-        gl->TexSubImage2D(GL_TEXTURE_2D, 0, 0, 0, (GLsizei)color->width_px,
-                          (GLsizei)color->height_px, GL_RGBA, type,
-                          at->link.memory + color->start);
-    }
-    gl->BindTexture(GL_TEXTURE_2D, 0);
-    GLenum error = gl->GetError();
-    if (error)
-        LOG_ONCE(&at->reported, REASON_UPLOAD,
-                 "filtered images cannot be uploaded (OpenGL error 0x%x)", error);
-    return !error;
-}
-
-static void release_images(session *at, bool is_uploaded) {
-    for (int eye = 0; eye < WIRE_EYES; ++eye) {
-        own_image *image = at->images + eye;
-        is_uploaded &=
-            XR_SUCCEEDED(at->instance->ReleaseSwapchainImage(image->handle, NULL));
-        image->is_acquired = image->is_waited = false;
-    }
-    at->frame.state = FRAME_NONE;
-    at->is_shown = is_uploaded;
-    at->shown = at->frame;
+static void add_time(session *at, uint64_t *stage_ns, uint64_t begun_ns) {
+    uint64_t spent_ns = now_ns() - begun_ns;
+    *stage_ns += spent_ns;
+    at->inside_ns += spent_ns;
 }
 
 /* Upload the filtered frame, if there is one. */
 static void take_result(session *at) {
-    gl_current before;
-    if (!at->link.is_accepted || at->frame.state != FRAME_FILTERED || !acquire_images(at) ||
-        !gl_enter(&at->gl, &before))
+    if (!at->link.is_accepted || at->frame.state != FRAME_FILTERED ||
+        !own_images_acquire(at))
         return;
     uint64_t begun_ns = now_ns();
-    bool is_uploaded = upload_images(at);
-    uint64_t spent_ns = now_ns() - begun_ns;
-    at->upload_ns += spent_ns;
-    at->inside_ns += spent_ns;
-    gl_leave(&at->gl, &before, true);
-    release_images(at, is_uploaded);
+    image_write writes[WIRE_EYES];
+    for (int eye = 0; eye < WIRE_EYES; ++eye)
+        writes[eye] = (image_write){at->images + eye, &at->frame.wire.views[eye].color};
+    bool is_written = at->api->write(at, writes, WIRE_EYES);
+    add_time(at, &at->upload_ns, begun_ns);
+    own_images_release(at, is_written);
 }
 
 /* Read the images of a plan, and send those that have been read. */
 static void give_frame(session *at, const plan *p, uint64_t limit_ns) {
-    gl_current before;
     if (!at->link.is_accepted || (!p && at->frame.state != FRAME_READING)) return;
-    if (!gl_enter(&at->gl, &before)) {
-        LOG_ONCE(&at->reported, REASON_OTHER_API,
-                 "frames end with a context of another window system; not filtered");
-        return;
-    }
     uint64_t begun_ns = now_ns();
-    if (p) read_images(at, p);
-    uint64_t spent_ns = now_ns() - begun_ns;
-    at->read_ns += spent_ns;
-    at->inside_ns += spent_ns;
-    if (at->frame.state == FRAME_READING) send_frame(at, limit_ns);
-    gl_leave(&at->gl, &before, false);
+    read_state read = p ? read_images(at, p) : READ_BEGUN;
+    if (read == READ_BEGUN && (!p || limit_ns)) read = at->api->finish_read(at, limit_ns);
+    add_time(at, &at->read_ns, begun_ns);
+    at->frame.state = read == READ_FAILED ? FRAME_NONE : FRAME_READING;
+    if (read == READ_DONE) send_frame(at);
 }
 
 void frames_begin(session *at) {
-    if (!at->has_gl || at->gl.is_software) return;
+    if (!at->api) return;
     pthread_mutex_lock(&at->lock);
     give_frame(at, NULL, 0);
     pthread_mutex_unlock(&at->lock);
@@ -554,7 +409,7 @@ XrResult frames_end(session *at, const XrFrameEndInfo *info) {
         return at->instance->EndFrame(at->handle, info);
     const XrCompositionLayerBaseHeader *layers[MAX_LAYERS];
     for (uint32_t i = 0; i < info->layerCount; ++i) layers[i] = info->layers[i];
-    if (!at->has_gl) return pass_on(at, info, layers);
+    if (!at->api) return pass_on(at, info, layers);
     substitute made;
     plan p;
     pthread_mutex_lock(&at->lock);
@@ -580,22 +435,14 @@ XrResult frames_end(session *at, const XrFrameEndInfo *info) {
 }
 
 void frames_close(session *at) {
-    if (!at->has_gl) return;
-    gl_current before;
-    if (gl_enter(&at->gl, &before)) {
-        if (at->pixels) at->gl.DeleteBuffers(1, &at->pixels);
-        if (at->is_read) at->gl.DeleteSync(at->is_read);
-        at->gl.DeleteFramebuffers(1, &at->gl.read_framebuffer);
-        at->gl.DeleteFramebuffers(1, &at->gl.draw_framebuffer);
-        at->gl.Finish();
-        gl_leave(&at->gl, &before, false);
-    }
-    for (int eye = 0; eye < WIRE_EYES; ++eye) destroy_image(at, at->images + eye);
+    if (!at->api) return;
+    at->api->finish(at);
+    own_images_destroy(at);
     for (unsigned i = 0; i < MAX_SPACES; ++i)
         if (at->spaces[i]) at->instance->DestroySpace(at->spaces[i]);
     if (at->view_space) at->instance->DestroySpace(at->view_space);
     if (at->gaze_space) at->instance->DestroySpace(at->gaze_space);
-    gl_close(&at->gl);
+    at->api->close(at);
     link_close(&at->link);
-    at->has_gl = false;
+    at->api = NULL;
 }

@@ -5,7 +5,7 @@
 #include <stdlib.h>
 #include <string.h>
 
-#include "layer.h"
+#include "gaze.h"
 #include "log.h"
 
 #define PROFILE "/interaction_profiles/ext/eye_gaze_interaction"

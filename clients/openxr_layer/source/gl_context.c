@@ -225,20 +225,13 @@ static const char *open_egl(gl_context *gl, const XrGraphicsBindingEGLMNDX *bind
 
 /* Both -------------------------------------------------------------------------------- */
 
-const char *gl_open(gl_context *gl, const XrSessionCreateInfo *info) {
-    *gl = (gl_context){.egl_context = EGL_NO_CONTEXT, .egl_surface = EGL_NO_SURFACE};
-    const char *reason = "the application does not use OpenGL on X11 or EGL";
-    for (const XrBaseInStructure *at = info->next; at; at = at->next) {
-        if (at->type == XR_TYPE_GRAPHICS_BINDING_OPENGL_XLIB_KHR) {
-            reason = open_glx(gl, (const XrGraphicsBindingOpenGLXlibKHR *)at);
-            break;
-        }
-        if (at->type == XR_TYPE_GRAPHICS_BINDING_EGL_MNDX) {
-            gl->is_egl = true;
-            reason = open_egl(gl, (const XrGraphicsBindingEGLMNDX *)at);
-            break;
-        }
-    }
+const char *gl_open(gl_context *gl, const XrBaseInStructure *binding) {
+    *gl = (gl_context){.is_egl = binding->type == XR_TYPE_GRAPHICS_BINDING_EGL_MNDX,
+                       .egl_context = EGL_NO_CONTEXT,
+                       .egl_surface = EGL_NO_SURFACE};
+    const char *reason = gl->is_egl
+                             ? open_egl(gl, (const XrGraphicsBindingEGLMNDX *)binding)
+                             : open_glx(gl, (const XrGraphicsBindingOpenGLXlibKHR *)binding);
     if (!reason) reason = load_gl(gl);
     gl_current before;
     if (!reason && !gl_enter(gl, &before)) reason = "its context cannot be made current";

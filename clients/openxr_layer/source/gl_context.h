@@ -80,8 +80,8 @@ typedef struct {
     EGLSurface egl_draw, egl_read;
 } gl_current;
 
-/* Create the context for a session's graphics binding; return a reason, or NULL. */
-const char *gl_open(gl_context *gl, const XrSessionCreateInfo *info);
+/* Create the context for a graphics binding, of GLX or EGL; return a reason, or NULL. */
+const char *gl_open(gl_context *gl, const XrBaseInStructure *binding);
 void gl_close(gl_context *gl);
 
 /* Make the context current.  Commands that the thread has submitted in the application's

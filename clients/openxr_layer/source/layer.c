@@ -4,107 +4,20 @@
  * them to a helper process, and shows the newest filtered frame in place of the
  * application's.  It passes on all other calls and layers unchanged.  See
  * docs/how-to/openxr-layer.md. */
-#include "layer.h"
-
 #include <openxr/openxr_loader_negotiation.h>
 #include <stdlib.h>
 #include <string.h>
 
+#include "frames.h"
+#include "gaze.h"
+#include "graphics.h"
 #include "log.h"
 
+#define LAYER_NAME "XR_APILAYER_ocufilter_eye"
 #define EXPORT __attribute__((visibility("default")))
 #define DEPTH XR_KHR_COMPOSITION_LAYER_DEPTH_EXTENSION_NAME
 #define GAZE XR_EXT_EYE_GAZE_INTERACTION_EXTENSION_NAME
 #define MAX_COPIED_RELEASES 4u
-
-/* Handles -------------------------------------------------------------------------------
- *
- * The lock protects the lists and not their items: the specification requires that the
- * application does not destroy a handle while another thread uses it. */
-
-static pthread_mutex_t registry = PTHREAD_MUTEX_INITIALIZER;
-static instance *instances;
-static session *sessions;
-static swapchain *swapchains;
-static space *spaces;
-
-#define ADD(list, item)                                                                  \
-    do {                                                                                 \
-        pthread_mutex_lock(&registry);                                                   \
-        (item)->next = list;                                                             \
-        list = item;                                                                     \
-        pthread_mutex_unlock(&registry);                                                 \
-    } while (0)
-
-#define REMOVE(type, list, item)                                                         \
-    do {                                                                                 \
-        pthread_mutex_lock(&registry);                                                   \
-        type **at_item = &list;                                                          \
-        while (*at_item != (item)) at_item = &(*at_item)->next;                          \
-        *at_item = (item)->next;                                                         \
-        pthread_mutex_unlock(&registry);                                                 \
-    } while (0)
-
-/* Move the items of a session from a list to a list of their own. */
-#define DETACH(type, list, is_own, detached)                                             \
-    do {                                                                                 \
-        pthread_mutex_lock(&registry);                                                   \
-        for (type **at_item = &list; *at_item;) {                                        \
-            type *item = *at_item;                                                       \
-            if (!(is_own)) {                                                             \
-                at_item = &item->next;                                                   \
-                continue;                                                                \
-            }                                                                            \
-            *at_item = item->next;                                                       \
-            item->next = detached;                                                       \
-            detached = item;                                                             \
-        }                                                                                \
-        pthread_mutex_unlock(&registry);                                                 \
-    } while (0)
-
-#define FIND(type, list, value)                                                          \
-    pthread_mutex_lock(&registry);                                                       \
-    type *found = list;                                                                  \
-    while (found && found->handle != (value)) found = found->next;                       \
-    pthread_mutex_unlock(&registry)
-
-static instance *find_instance(XrInstance handle) {
-    FIND(instance, instances, handle);
-    return found;
-}
-
-static instance *next_instance(const instance *after) {
-    pthread_mutex_lock(&registry);
-    instance *found = after ? after->next : instances;
-    pthread_mutex_unlock(&registry);
-    return found;
-}
-
-static session *find_session(XrSession handle) {
-    FIND(session, sessions, handle);
-    return found;
-}
-
-swapchain *find_swapchain(XrSwapchain handle) {
-    FIND(swapchain, swapchains, handle);
-    return found;
-}
-
-static space *find_space(XrSpace handle) {
-    FIND(space, spaces, handle);
-    return found;
-}
-
-bool find_reference_space(XrSpace handle, reference_space *found) {
-    const space *known = find_space(handle);
-    if (known) *found = known->kind;
-    return known;
-}
-
-/* A forked child has a copy of the connections, which would keep the helper occupied. */
-static void abandon_links(void) {
-    for (session *at = sessions; at; at = at->next) link_abandon(&at->link);
-}
 
 /* Sessions ------------------------------------------------------------------------------- */
 
@@ -115,18 +28,10 @@ static void destroy_swapchain(swapchain *chain) {
 
 /* Forget a session and what belongs to it; its handles are destroyed by the runtime. */
 static void destroy_session(session *at) {
-    swapchain *chains = NULL;
-    space *known = NULL;
-    DETACH(swapchain, swapchains, item->session == at, chains);
-    DETACH(space, spaces, item->session == at->handle, known);
+    swapchain *chains = detach_swapchains(at);
+    space *known = detach_spaces(at);
     pthread_mutex_lock(&at->lock);
-    gl_current before;
-    /* Textures would live on in the application's context, which shares them. */
-    if (at->has_gl && gl_enter(&at->gl, &before)) {
-        for (swapchain *chain = chains; chain; chain = chain->next)
-            if (chain->copy) at->gl.DeleteTextures(1, &chain->copy);
-        gl_leave(&at->gl, &before, false);
-    }
+    if (at->api) at->api->destroy_copies(at, chains);
     frames_close(at);
     pthread_mutex_unlock(&at->lock);
     for (swapchain *next; chains; chains = next) {
@@ -137,9 +42,24 @@ static void destroy_session(session *at) {
         next = known->next;
         free(known);
     }
-    REMOVE(session, sessions, at);
+    remove_session(at);
     pthread_mutex_destroy(&at->lock);
     free(at);
+}
+
+/* Open the graphics API that a session uses; return a reason, or NULL. */
+static const char *open_graphics(session *at, const XrSessionCreateInfo *info) {
+    for (const XrBaseInStructure *found = info->next; found; found = found->next) {
+        const graphics_api *api =
+            found->type == XR_TYPE_GRAPHICS_BINDING_OPENGL_XLIB_KHR ||
+                    found->type == XR_TYPE_GRAPHICS_BINDING_EGL_MNDX
+                ? &gl_api
+                : NULL;
+        const char *reason = api ? api->open(at, found) : NULL;
+        if (api && !reason) at->api = api;
+        if (api) return reason;
+    }
+    return "the application does not use OpenGL on X11 or EGL";
 }
 
 static XRAPI_ATTR XrResult XRAPI_CALL layer_CreateSession(XrInstance handle,
@@ -158,10 +78,9 @@ static XRAPI_ATTR XrResult XRAPI_CALL layer_CreateSession(XrInstance handle,
     at->instance = own;
     pthread_mutex_init(&at->lock, NULL);
     link_init(&at->link, own->application, own->engine);
-    const char *reason = gl_open(&at->gl, info);
-    at->has_gl = !reason;
+    const char *reason = open_graphics(at, info);
     if (reason) LOG("the application's own frames are shown: %s", reason);
-    ADD(sessions, at);
+    add_session(at);
     return result;
 }
 
@@ -196,22 +115,8 @@ static XRAPI_ATTR XrResult XRAPI_CALL layer_PollEvent(XrInstance handle,
         event->type != XR_TYPE_EVENT_DATA_REFERENCE_SPACE_CHANGE_PENDING)
         return result;
     const XrEventDataReferenceSpaceChangePending *change = (const void *)event;
-    pthread_mutex_lock(&registry);
-    session *at = sessions;
-    while (at && at->handle != change->session) at = at->next;
-    if (at) at->recentered[at->recentered_count++ % MAX_RECENTERED] = change->changeTime;
-    pthread_mutex_unlock(&registry);
+    note_recentered(change->session, change->changeTime);
     return result;
-}
-
-/* Whether a space got another origin after the first time, up to the last one. */
-bool is_recentered_between(session *at, XrTime first, XrTime last) {
-    bool is_between = false;
-    pthread_mutex_lock(&registry);
-    for (int i = 0; i < MAX_RECENTERED; ++i)
-        is_between |= first < at->recentered[i] && at->recentered[i] <= last;
-    pthread_mutex_unlock(&registry);
-    return is_between;
 }
 
 /* Spaces --------------------------------------------------------------------------------- */
@@ -227,7 +132,7 @@ static XRAPI_ATTR XrResult XRAPI_CALL layer_CreateReferenceSpace(
     known->session = handle;
     known->instance = at->instance;
     known->kind = (reference_space){info->referenceSpaceType, info->poseInReferenceSpace};
-    ADD(spaces, known);
+    add_space(known);
     return result;
 }
 
@@ -235,7 +140,7 @@ static XRAPI_ATTR XrResult XRAPI_CALL layer_DestroySpace(XrSpace handle) {
     space *known = find_space(handle);
     if (known) {
         PFN_xrDestroySpace destroy = known->instance->DestroySpace;
-        REMOVE(space, spaces, known);
+        remove_space(known);
         free(known);
         return destroy(handle);
     }
@@ -266,16 +171,12 @@ static XRAPI_ATTR XrResult XRAPI_CALL layer_CreateSwapchain(
     pthread_mutex_init(&chain->lock, NULL);
     chain->info = *info;
     chain->info.next = NULL;
-    XrSwapchainImageOpenGLKHR images[MAX_IMAGES];
-    for (int i = 0; i < MAX_IMAGES; ++i)
-        images[i] = (XrSwapchainImageOpenGLKHR){.type = XR_TYPE_SWAPCHAIN_IMAGE_OPENGL_KHR};
-    if (at->has_gl && XR_SUCCEEDED(at->instance->EnumerateSwapchainImages(
-                          *made, MAX_IMAGES, &chain->image_count,
-                          (XrSwapchainImageBaseHeader *)images)))
-        for (uint32_t i = 0; i < chain->image_count; ++i) chain->images[i] = images[i].image;
-    else
-        chain->image_count = 0;
-    ADD(swapchains, chain);
+    if (at->api && info->faceCount == 1) {
+        chain->format = at->api->format_of(info->format);
+        chain->image_count = at->api->find_images(at, *made, chain->images);
+        if (!chain->image_count) chain->format = NULL;
+    }
+    add_swapchain(chain);
     return result;
 }
 
@@ -283,14 +184,11 @@ static XRAPI_ATTR XrResult XRAPI_CALL layer_DestroySwapchain(XrSwapchain handle)
     swapchain *chain = find_swapchain(handle);
     if (!chain) return XR_ERROR_HANDLE_INVALID;
     session *at = chain->session;
-    gl_current before;
+    remove_swapchain(chain);
+    chain->next = NULL;
     pthread_mutex_lock(&at->lock);
-    if (chain->copy && at->has_gl && gl_enter(&at->gl, &before)) {
-        at->gl.DeleteTextures(1, &chain->copy);
-        gl_leave(&at->gl, &before, false);
-    }
+    if (chain->copy && at->api) at->api->destroy_copies(at, chain);
     pthread_mutex_unlock(&at->lock);
-    REMOVE(swapchain, swapchains, chain);
     destroy_swapchain(chain);
     return at->instance->DestroySwapchain(handle);
 }
@@ -318,23 +216,17 @@ static uint32_t next_released(swapchain *chain) {
 static void copy_released(swapchain *chain) {
     session *at = chain->session;
     uint32_t index = next_released(chain);
-    /* Images of quads and other layers need no copy. */
-    if (!at->has_gl || !swapchain_can_copy(chain)) return;
+    if (!at->api || !chain->format) return;
     pthread_mutex_lock(&at->lock);
-    gl_current before;
     uint64_t begun_ns = now_ns();
-    if (!at->link.is_accepted || index >= chain->image_count ||
-        chain->unused_releases >= MAX_COPIED_RELEASES) {
-        chain->has_copy = false; /* not of this image */
-    } else if (gl_enter(&at->gl, &before)) {
+    /* Images of quads and other layers need no copy. */
+    bool is_used = at->link.is_accepted && index < chain->image_count &&
+                   chain->unused_releases < MAX_COPIED_RELEASES;
+    /* Without one, an earlier copy is not of this image. */
+    chain->has_copy = is_used && at->api->copy(chain, chain->images[index]);
+    if (is_used) {
         ++chain->unused_releases;
-        swapchain_copy(chain, chain->images[index]);
-        gl_leave(&at->gl, &before, true);
         at->copy_ns += now_ns() - begun_ns;
-    } else {
-        LOG_ONCE(&at->reported, REASON_OTHER_API,
-                 "images are released with a context of another window system; not "
-                 "filtered");
     }
     pthread_mutex_unlock(&at->lock);
 }
@@ -459,26 +351,18 @@ static XRAPI_ATTR XrResult XRAPI_CALL layer_CreateApiLayerInstance(
            sizeof own->application - 1);
     memcpy(own->engine, info->applicationInfo.engineName, sizeof own->engine - 1);
     if (own->has_gaze) gaze_create(own);
-    ADD(instances, own);
+    add_instance(own);
     static pthread_once_t once = PTHREAD_ONCE_INIT;
     pthread_once(&once, watch_forks);
     return result;
-}
-
-static session *session_of(const instance *own) {
-    pthread_mutex_lock(&registry);
-    session *found = sessions;
-    while (found && found->instance != own) found = found->next;
-    pthread_mutex_unlock(&registry);
-    return found;
 }
 
 static XRAPI_ATTR XrResult XRAPI_CALL layer_DestroyInstance(XrInstance handle) {
     instance *own = find_instance(handle);
     if (!own) return XR_ERROR_HANDLE_INVALID;
     PFN_xrDestroyInstance destroy = own->DestroyInstance;
-    for (session *at; (at = session_of(own));) destroy_session(at);
-    REMOVE(instance, instances, own);
+    for (session *at; (at = session_of_instance(own));) destroy_session(at);
+    remove_instance(own);
     free(own);
     return destroy(handle);
 }

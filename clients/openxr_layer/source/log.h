@@ -16,8 +16,8 @@
 /* Reasons that are reported once per session. */
 typedef enum {
     REASON_NEXT_CHAIN,
+    REASON_COPY,
     REASON_FORMAT,
-    REASON_GL_ERROR,
     REASON_MEMORY,
     REASON_NO_HELPER,
     REASON_OTHER_API,

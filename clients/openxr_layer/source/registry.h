@@ -1,15 +1,13 @@
 /* What the layer knows of the application's instances, sessions, swapchains and spaces. */
-#ifndef OCU_LAYER_H
-#define OCU_LAYER_H
+#ifndef OCU_LAYER_REGISTRY_H
+#define OCU_LAYER_REGISTRY_H
 
+#include <openxr/openxr.h>
 #include <pthread.h>
 
-#include "gl_context.h"
 #include "link.h"
 
-#define LAYER_NAME "XR_APILAYER_ocufilter_eye"
 #define MAX_IMAGES 32
-#define MAX_LAYERS 64
 #define MAX_RECENTERED 4
 #define MAX_SPACES 4
 
@@ -67,17 +65,25 @@ typedef struct space {
     reference_space kind;
 } space;
 
+/* A format of swapchain images that can be copied. */
+typedef struct {
+    int64_t format; /* of the graphics API */
+    uint32_t wire;  /* of color; 0 for depth */
+    uint32_t flags; /* of a wire_frame with it */
+} image_format;
+
 typedef struct swapchain {
     struct swapchain *next;
     XrSwapchain handle;
     struct session *session;
     XrSwapchainCreateInfo info;
+    const image_format *format; /* NULL: its images cannot be copied */
     uint32_t image_count;
-    GLuint images[MAX_IMAGES];
+    uint64_t images[MAX_IMAGES];
     pthread_mutex_t lock;          /* of these: several threads may acquire and release */
     uint32_t acquired[MAX_IMAGES]; /* indices, the oldest first */
     uint32_t acquired_count;
-    GLuint copy;                   /* of the image that was released last */
+    void *copy;                    /* of the image that was released last */
     bool has_copy;
     unsigned unused_releases;      /* since a frame with this swapchain was filtered */
 } swapchain;
@@ -100,7 +106,7 @@ typedef struct {
     int64_t format;
     uint32_t width_px, height_px;
     uint32_t image_count;
-    GLuint images[MAX_IMAGES];
+    uint64_t images[MAX_IMAGES];
     bool is_acquired, is_waited;
     uint32_t index;        /* of the acquired image */
 } own_image;
@@ -112,15 +118,12 @@ typedef struct session {
     /* times of the latest changes of the origins of spaces, under the registry's lock */
     XrTime recentered[MAX_RECENTERED];
     unsigned recentered_count;
-    pthread_mutex_t lock;  /* of everything below; held while the context is current */
-    bool has_gl;
-    gl_context gl;
+    pthread_mutex_t lock;  /* of everything below; held while graphics are used */
+    const struct graphics_api *api; /* NULL: not filtered */
+    void *graphics;        /* of the API */
     link_state link;
     unsigned reported;
     app_frame frame;       /* the one that the helper has */
-    GLuint pixels;         /* buffer that it is read into, without software rendering */
-    size_t pixels_bytes;
-    GLsync is_read;
     uint64_t next_frame;
     own_image images[WIRE_EYES];
     bool is_shown;         /* `images` contain the result of `shown` */
@@ -136,29 +139,38 @@ typedef struct session {
     uint64_t inside_ns;    /* of the current frame, in read_ns and upload_ns */
 } session;
 
-/* swapchains.c */
-bool swapchain_can_copy(const swapchain *chain);
-void swapchain_copy(swapchain *chain, GLuint image);
-void swapchain_read(const swapchain *chain, const XrSwapchainSubImage *part,
-                    uint32_t format, void *target);
-uint32_t wire_format_of(int64_t format);
-bool is_depth_format(int64_t format);
+void add_instance(instance *item);
+void add_session(session *item);
+void add_swapchain(swapchain *item);
+void add_space(space *item);
 
-/* gaze.c */
-void gaze_create(instance *own);
-XrResult gaze_suggest(instance *own, const XrInteractionProfileSuggestedBinding *given);
-XrResult gaze_attach(session *at, const XrSessionActionSetsAttachInfo *given);
-XrResult gaze_sync(session *at, const XrActionsSyncInfo *given);
-void gaze_locate(session *at, XrTime time, wire_frame *frame);
+/* Remove an item from its list; it is not freed. */
+void remove_instance(instance *item);
+void remove_session(session *item);
+void remove_swapchain(swapchain *item);
+void remove_space(space *item);
 
-/* frames.c */
-void frames_begin(session *at);
-XrResult frames_end(session *at, const XrFrameEndInfo *info);
-void frames_close(session *at);
-
-/* layer.c */
+instance *find_instance(XrInstance handle);
+session *find_session(XrSession handle);
 swapchain *find_swapchain(XrSwapchain handle);
+space *find_space(XrSpace handle);
 bool find_reference_space(XrSpace handle, reference_space *found);
+
+/* Return the instance behind another one in the list; the first one after NULL. */
+instance *next_instance(const instance *after);
+session *session_of_instance(const instance *own);
+
+/* Remove the items of a session from their list and return them as one. */
+swapchain *detach_swapchains(const session *at);
+space *detach_spaces(const session *at);
+
+/* Note that a space of a session gets another origin. */
+void note_recentered(XrSession handle, XrTime time);
+
+/* Whether a space got another origin after the first time, up to the last one. */
 bool is_recentered_between(session *at, XrTime first, XrTime last);
+
+/* Give up all connections to the helper, in a forked child. */
+void abandon_links(void);
 
 #endif
