@@ -29,7 +29,8 @@ WITHOUT = {
     ),
     "clients.openxr_layer._layer": (
         "`ocufilter layer` will not work; install a C compiler and headers (Debian: "
-        "apt install gcc libc6-dev libopenxr-dev libgl-dev libegl-dev libx11-dev)"
+        "apt install gcc libc6-dev libopenxr-dev libgl-dev libegl-dev libvulkan-dev "
+        "libx11-dev)"
     ),
 }
 """Libraries, and what to do where one cannot be compiled."""

@@ -1,6 +1,7 @@
 """Images of a frame in the layer's shared memory, as the filter takes and gives them.
 
-Rows begin at the bottom, except in views whose upper edge is below the lower one.
+Rows begin at the bottom, as in OpenGL, or at the top, as in Vulkan; the other way round
+in views whose upper edge is below the lower one.
 """
 
 from __future__ import annotations
@@ -107,7 +108,8 @@ class FrameImages:
         given = self._frame.views[index]
         raw = self._colors[index][self._rows(index)]
         color = np.empty((*raw.shape[:2], 3), raw.dtype)
-        _copy_channels(color, raw)
+        for channel, place in enumerate(self._channels):
+            color[..., channel] = raw[..., place]
         if self._frame.color_format == wire.LINEAR8:
             color = _HALF_OF_BYTE[color]
         depth_m, note = self._depth_m(index)
@@ -121,7 +123,18 @@ class FrameImages:
 
     def _rows(self, index: int) -> slice:
         _, _, up, down = self._frame.views[index].fov_rad
-        return slice(None, None, -1 if up > down else 1)
+        is_upright = up > down
+        is_top_first = bool(self._frame.flags & wire.TOP_FIRST)
+        return slice(None, None, 1 if is_top_first == is_upright else -1)
+
+    @property
+    def _channels(self) -> tuple[int, int, int]:
+        """Return where red, green and blue are in a pixel.
+
+        Images are copied one channel after the other: NumPy's copy of all three, three
+        values at a time, takes four to six times as long.
+        """
+        return (2, 1, 0) if self._frame.flags & wire.IS_BGR else (0, 1, 2)
 
     def _depth_m(self, index: int) -> tuple[NDArray[np.float32] | None, str]:
         values, given = self._depths[index], self._frame.views[index]
@@ -153,19 +166,12 @@ class FrameImages:
         begin = round(plain_ratio * to.shape[1])
         if self._frame.color_format == wire.LINEAR8:
             color = _BYTE_OF_HALF[color.view(np.uint16)]
-        _copy_channels(to[self._rows(index), begin:], color[:, begin:])
+        part = to[self._rows(index), begin:]
+        for channel, place in enumerate(self._channels):
+            part[..., place] = color[:, begin:, channel]
         # Runtimes ignore the alpha of a layer that is not blended; screenshots do not.
         if not self._frame.flags & wire.IS_BLENDED:
             to[..., 3] = 255 if to.dtype == np.uint8 else 1.0
-
-
-def _copy_channels(to: NDArray[Any], color: NDArray[Any]) -> None:
-    """Copy red, green and blue between images, one after the other.
-
-    NumPy's copy of all three, three values at a time, takes four to six times as long.
-    """
-    for channel in range(3):
-        to[..., channel] = color[..., channel]
 
 
 # Depth that a program submits, which is often wrong

@@ -47,7 +47,7 @@ LAYER_NAME = "XR_APILAYER_ocufilter_eye"
 OFF_VARIABLE = "DISABLE_XR_APILAYER_OCUFILTER_EYE"
 LIBRARY_VARIABLE = "OCUFILTER_LAYER_LIBRARY"
 ENTRY_POINT = "xrNegotiateLoaderApiLayerInterface"
-HEADERS = "libopenxr-dev libgl-dev libegl-dev libx11-dev"
+HEADERS = "libopenxr-dev libgl-dev libegl-dev libvulkan-dev libx11-dev"
 
 Kind = Literal["explicit", "implicit"]
 
@@ -355,8 +355,8 @@ def library() -> Path:
     if not path.is_file():
         raise NoLayer(
             "the layer was not built; it requires Linux, a C compiler and the headers "
-            f"of OpenXR, OpenGL and X11 (Debian: apt install gcc {HEADERS}); then "
-            "install ocufilter again"
+            "of OpenXR, OpenGL, Vulkan and X11 (Debian: apt install gcc "
+            f"{HEADERS}); then install ocufilter again"
         )
     try:
         getattr(ctypes.CDLL(str(path)), ENTRY_POINT)

@@ -15,13 +15,13 @@ from typing import Any
 
 from estimator.bounded_files import loads_bounded
 
-MAGIC, VERSION = 0x4F435558, 1
+MAGIC, VERSION = 0x4F435558, 2
 HELLO, WELCOME, MEMORY, FRAME, RESULT = 1, 2, 3, 4, 5
 CONTROL = 100
 """A request of `ocufilter layer set` or `status`: JSON after the kind."""
 
 SRGB8, LINEAR8, LINEAR16F = 1, 2, 3
-HAS_HEAD, HAS_GAZE, IS_BLENDED = 1, 2, 4
+HAS_HEAD, HAS_GAZE, IS_BLENDED, TOP_FIRST, IS_BGR = 1, 2, 4, 8, 16
 
 MAX_SIDE_PX = 16384
 MAX_SHARED_BYTES = 1 << 30

@@ -1,5 +1,5 @@
 #!/bin/sh
-# Download the headers of OpenXR, OpenGL, EGL and X11 that the OpenXR layer is compiled
+# Download the headers of OpenXR, OpenGL, EGL, Vulkan and X11 that the OpenXR layer is compiled
 # with.  They are the same for every processor.  Nothing is installed.
 #
 #   sh tests/release/headers.sh FOLDER     writes FOLDER/usr/include
@@ -8,7 +8,8 @@
 # mirror that the machine's apt uses, or from DEBIAN_MIRROR.
 set -eu
 RELEASE=trixie
-PACKAGES="libopenxr-dev libgl-dev libglx-dev libegl-dev libx11-dev x11proto-dev"
+PACKAGES="libopenxr-dev libgl-dev libglx-dev libegl-dev libvulkan-dev libx11-dev
+    x11proto-dev"
 
 folder=$1
 if [ -e "$folder/.complete" ]; then exit 0; fi

@@ -32,6 +32,8 @@ CONSTANTS = {
     "WIRE_HAS_HEAD": wire.HAS_HEAD,
     "WIRE_HAS_GAZE": wire.HAS_GAZE,
     "WIRE_IS_BLENDED": wire.IS_BLENDED,
+    "WIRE_TOP_FIRST": wire.TOP_FIRST,
+    "WIRE_IS_BGR": wire.IS_BGR,
 }
 
 

@@ -52,6 +52,6 @@ typedef struct graphics_api {
     void (*finish)(session *at);
 } graphics_api;
 
-extern const graphics_api gl_api;
+extern const graphics_api gl_api, vk_api;
 
 #endif

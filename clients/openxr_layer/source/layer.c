@@ -12,6 +12,7 @@
 #include "gaze.h"
 #include "graphics.h"
 #include "log.h"
+#include "vk_context.h"
 
 #define LAYER_NAME "XR_APILAYER_ocufilter_eye"
 #define EXPORT __attribute__((visibility("default")))
@@ -51,15 +52,17 @@ static void destroy_session(session *at) {
 static const char *open_graphics(session *at, const XrSessionCreateInfo *info) {
     for (const XrBaseInStructure *found = info->next; found; found = found->next) {
         const graphics_api *api =
-            found->type == XR_TYPE_GRAPHICS_BINDING_OPENGL_XLIB_KHR ||
+            found->type == XR_TYPE_GRAPHICS_BINDING_VULKAN_KHR ? &vk_api
+            : found->type == XR_TYPE_GRAPHICS_BINDING_OPENGL_XLIB_KHR ||
                     found->type == XR_TYPE_GRAPHICS_BINDING_EGL_MNDX
                 ? &gl_api
                 : NULL;
-        const char *reason = api ? api->open(at, found) : NULL;
-        if (api && !reason) at->api = api;
-        if (api) return reason;
+        if (!api) continue;
+        const char *reason = api->open(at, found);
+        if (!reason) at->api = api;
+        return reason;
     }
-    return "the application does not use OpenGL on X11 or EGL";
+    return "the application uses neither Vulkan nor OpenGL on X11 or EGL";
 }
 
 static XRAPI_ATTR XrResult XRAPI_CALL layer_CreateSession(XrInstance handle,
@@ -119,6 +122,20 @@ static XRAPI_ATTR XrResult XRAPI_CALL layer_PollEvent(XrInstance handle,
     return result;
 }
 
+static XRAPI_ATTR XrResult XRAPI_CALL layer_CreateVulkanDeviceKHR(
+    XrInstance handle, const XrVulkanDeviceCreateInfoKHR *info, VkDevice *made,
+    VkResult *vulkan_result) {
+    instance *own = find_instance(handle);
+    PFN_xrCreateVulkanDeviceKHR create = NULL;
+    if (!own || XR_FAILED(own->get_proc_addr(handle, "xrCreateVulkanDeviceKHR",
+                                             (PFN_xrVoidFunction *)&create)))
+        return XR_ERROR_HANDLE_INVALID;
+    XrResult result = create(handle, info, made, vulkan_result);
+    if (XR_SUCCEEDED(result) && *vulkan_result == VK_SUCCESS)
+        vk_note_device(own, info, *made);
+    return result;
+}
+
 /* Spaces --------------------------------------------------------------------------------- */
 
 static XRAPI_ATTR XrResult XRAPI_CALL layer_CreateReferenceSpace(
@@ -159,7 +176,12 @@ static XRAPI_ATTR XrResult XRAPI_CALL layer_CreateSwapchain(
     XrSession handle, const XrSwapchainCreateInfo *info, XrSwapchain *made) {
     session *at = find_session(handle);
     if (!at) return XR_ERROR_HANDLE_INVALID;
-    XrResult result = at->instance->CreateSwapchain(handle, info, made);
+    XrSwapchainCreateInfo mine = *info;
+    if (at->api) mine.usageFlags |= at->api->usage;
+    XrResult result = at->instance->CreateSwapchain(handle, &mine, made);
+    bool can_copy = XR_SUCCEEDED(result);
+    if (!can_copy && mine.usageFlags != info->usageFlags)
+        result = at->instance->CreateSwapchain(handle, info, made);
     if (XR_FAILED(result)) return result;
     swapchain *chain = calloc(1, sizeof *chain);
     if (!chain) {
@@ -171,7 +193,7 @@ static XRAPI_ATTR XrResult XRAPI_CALL layer_CreateSwapchain(
     pthread_mutex_init(&chain->lock, NULL);
     chain->info = *info;
     chain->info.next = NULL;
-    if (at->api && info->faceCount == 1) {
+    if (at->api && can_copy && info->faceCount == 1) {
         chain->format = at->api->format_of(info->format);
         chain->image_count = at->api->find_images(at, *made, chain->images);
         if (!chain->image_count) chain->format = NULL;
@@ -382,6 +404,7 @@ static XRAPI_ATTR XrResult XRAPI_CALL layer_GetInstanceProcAddr(
         F(CreateReferenceSpace),
         F(CreateSession),
         F(CreateSwapchain),
+        F(CreateVulkanDeviceKHR),
         F(DestroyInstance),
         F(DestroySession),
         F(DestroySpace),
@@ -394,13 +417,17 @@ static XRAPI_ATTR XrResult XRAPI_CALL layer_GetInstanceProcAddr(
         F(SyncActions),
 #undef F
     };
+    /* Functions of extensions exist only where the runtime has them. */
+    instance *own = find_instance(handle);
+    XrResult result =
+        own ? own->get_proc_addr(handle, name, function) : XR_ERROR_HANDLE_INVALID;
+    if (own && XR_FAILED(result)) return result;
     for (size_t i = 0; i < sizeof OWN / sizeof *OWN; ++i) {
         if (strcmp(name, OWN[i].name)) continue;
         *function = OWN[i].function;
         return XR_SUCCESS;
     }
-    instance *own = find_instance(handle);
-    return own ? own->get_proc_addr(handle, name, function) : XR_ERROR_HANDLE_INVALID;
+    return result;
 }
 
 EXPORT XRAPI_ATTR XrResult XRAPI_CALL xrNegotiateLoaderApiLayerInterface(

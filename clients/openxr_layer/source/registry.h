@@ -45,6 +45,8 @@ typedef struct instance {
 #undef F
     char application[XR_MAX_APPLICATION_NAME_SIZE], engine[XR_MAX_ENGINE_NAME_SIZE];
     bool is_depth_stripped; /* the runtime does not take depth, the application submits it */
+    void *vulkan_device;  /* that was created through XR_KHR_vulkan_enable2 last */
+    PFN_xrVoidFunction vulkan_get_proc; /* its application's vkGetInstanceProcAddr */
     bool has_gaze;        /* XR_EXT_eye_gaze_interaction is enabled */
     bool is_gaze_suggested;
     XrActionSet gaze_set;

@@ -12,22 +12,24 @@
 #include <stdint.h>
 
 #define WIRE_MAGIC 0x4f435558u /* "OCUX" */
-#define WIRE_VERSION 1u
+#define WIRE_VERSION 2u
 #define WIRE_EYES 2
 
 enum { WIRE_HELLO = 1, WIRE_WELCOME, WIRE_MEMORY, WIRE_FRAME, WIRE_RESULT };
 
-/* Format of color images.  Rows begin at the bottom, as in OpenGL. */
+/* Format of color images. */
 enum {
-    WIRE_SRGB8 = 1,   /* RGBA, sRGB */
-    WIRE_LINEAR8,     /* RGBA, linear light */
-    WIRE_LINEAR16F    /* RGBA, linear light, half floats */
+    WIRE_SRGB8 = 1,   /* bytes, sRGB */
+    WIRE_LINEAR8,     /* bytes, linear light */
+    WIRE_LINEAR16F    /* half floats, linear light */
 };
 
 enum {
     WIRE_HAS_HEAD = 1,
     WIRE_HAS_GAZE = 2,
-    WIRE_IS_BLENDED = 4 /* the layer below shows through the alpha channel */
+    WIRE_IS_BLENDED = 4, /* the layer below shows through the alpha channel */
+    WIRE_TOP_FIRST = 8,  /* rows begin at the top; otherwise at the bottom, as in OpenGL */
+    WIRE_IS_BGR = 16     /* channels are BGRA; otherwise RGBA */
 };
 
 typedef struct {
