@@ -47,6 +47,7 @@ SYSTEM_PACKAGES="monado-service monado-cli libopenxr1-monado libopenxr-loader1
     mesa-vulkan-drivers libegl1 libgl1 libglx-mesa0 libgl1-mesa-dri libgles2
     libopengl0 xvfb xauth python3 python3-venv gcc libc6-dev iproute2
     libopenxr-dev libopenxr-utils libgl-dev libegl-dev libx11-dev
+    libvulkan-dev vulkan-validationlayers
     openxr-layer-apidump openxr-layer-corevalidation
     xserver-xorg-core xserver-xorg-video-dummy"
 PYTHON_PACKAGES="pytest pyopenxr>=1.1,<1.2 trimesh networkx"

@@ -23,12 +23,13 @@ RUNTIME = Path(__file__).with_name("mock_runtime")
 DRIVER = Path(__file__).with_name("driver")
 COMPILER = shutil.which("cc")
 HEADERS = ("openxr/openxr.h", "openxr/openxr_platform.h", "GL/glx.h", "EGL/egl.h")
+HEADERS += ("vulkan/vulkan.h",)
 INCLUDE = Path("/usr/include")
 
 WARNINGS = ("-Wall", "-Wextra", "-Werror")
 FLAGS = ("-std=gnu11", "-O1", "-g", *WARNINGS)
 UNSEEN_LIBRARIES = ("libgallium", "libEGL_mesa", "libGLX_mesa")
-LIBRARIES = ("-lGL", "-lEGL", "-lX11", "-lm", "-lpthread")
+LIBRARIES = ("-lGL", "-lEGL", "-lX11", "-lvulkan", "-lm", "-lpthread")
 
 
 def missing() -> str | None:

@@ -38,14 +38,16 @@ def pixels_of(folder: Path, image: dict) -> np.ndarray:
     """
     *_, width_px, height_px = image["rect"]
     content = (folder / image["file"]).read_bytes()
-    if "DEPTH" in image["format"]:
+    format_name = image["format"]
+    if "DEPTH" in format_name or format_name.startswith("VK_D"):
         return np.frombuffer(content, np.float32).reshape(height_px, width_px)
-    if image["format"] == "GL_RGB10_A2":
+    if format_name in ("GL_RGB10_A2", "VK_A2B10G10R10_UNORM"):
         packed = np.frombuffer(content, np.uint32).reshape(height_px, width_px, 1)
         parts = packed >> np.array([0, 10, 20, 30], np.uint32) & 1023
         return parts.astype(np.uint16)
-    kind = np.float16 if image["format"] == "GL_RGBA16F" else np.uint8
-    return np.frombuffer(content, kind).reshape(height_px, width_px, 4)
+    kind = np.float16 if "16" in format_name else np.uint8
+    pixels = np.frombuffer(content, kind).reshape(height_px, width_px, 4)
+    return pixels[..., [2, 1, 0, 3]] if "_B8" in format_name else pixels
 
 
 def drawn(frame: int, view: int, size_px: tuple[int, int]) -> np.ndarray:

@@ -6,12 +6,16 @@ run_hello_xr   Khronos' sample, for some frames
 
 import json
 import os
+import re
 import subprocess
 from pathlib import Path
 
 from tests.openxr_layer.captured import read_frames
 
 TIMEOUT_S = 150
+VALIDATION = re.compile("VUID|SYNC-HAZARD|Validation (Error|Warning)", re.IGNORECASE)
+"""Lines of Khronos' validation layer."""
+
 SIZE_PX = (128, 96)
 """Of a view, unless MOCK_XR_SIZE says otherwise."""
 
@@ -73,9 +77,14 @@ class Run:
 
 
 def run_hello_xr(
-    runtime: Path, folder: Path, display: str, n_frames: int, **variables: str
+    runtime: Path,
+    folder: Path,
+    display: str,
+    n_frames: int,
+    graphics: str = "OpenGL",
+    **variables: str,
 ) -> tuple[list[dict], list[str]]:
-    """Run `hello_xr -g OpenGL` until the runtime ends its session.
+    """Run `hello_xr` until the runtime ends its session.
 
     Parameters
     ----------
@@ -85,11 +94,13 @@ def run_hello_xr(
         Name of an X display, of `tests.headset.xorg.Xorg`.
     n_frames : int
         That are shown.
+    graphics : "OpenGL", "Vulkan" or "Vulkan2"
+        API and, for Vulkan, the version of the extension.
 
     Returns
     -------
     list of dict, list of str
-        Captured frames that have layers, and violations.
+        Captured frames that have layers, and violations of OpenXR and of Vulkan.
 
     Raises
     ------
@@ -101,7 +112,7 @@ def run_hello_xr(
     with (
         said_path.open("wb") as said,
         subprocess.Popen(
-            ["timeout", str(TIMEOUT_S), "hello_xr", "-g", "OpenGL"],
+            ["timeout", str(TIMEOUT_S), "hello_xr", "-g", graphics],
             env=_environment(runtime, captured) | own | variables,
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
@@ -109,14 +120,18 @@ def run_hello_xr(
             text=True,
         ) as program,
     ):
+        vulkan = []
         for line in program.stdout:
+            if VALIDATION.search(line):
+                vulkan.append(line)
             if "SESSION_STATE_EXITING" in line:
                 break
         program.communicate()  # it waits for a key, or the end of its input
     text = said_path.read_text(errors="replace")
     if program.returncode != 0:
         raise RuntimeError(f"hello_xr: {program.returncode}: {text[-2000:]}")
-    return _shown_frames(captured), _violations(text)
+    vulkan += [line for line in text.splitlines() if VALIDATION.search(line)]
+    return _shown_frames(captured), _violations(text) + vulkan
 
 
 def _environment(runtime: Path, captured: Path) -> dict[str, str]:

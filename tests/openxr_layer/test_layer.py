@@ -57,6 +57,7 @@ def floats(numbers):
 
 
 FULL = {"GL_RGBA16F": 1.0, "GL_RGB10_A2": 1023.0}
+FULL |= {"VK_R16G16B16A16_SFLOAT": 1.0, "VK_A2B10G10R10_UNORM": 1023.0}
 
 
 def levels(view, pixels):

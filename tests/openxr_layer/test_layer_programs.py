@@ -63,7 +63,8 @@ def moving_head(tmp_path):
 
 
 def filtered_by_hand(eye, picture):
-    """Return what `EyeFilter` gives for a picture of linear light, as bytes."""
+    """Return what `EyeFilter` gives for a picture, as bytes of its own encoding."""
+    is_srgb = picture.color.dtype == np.uint8
     body = body_of_eye(PROFILES[eye], eye)
     with EyeFilter(body, picture.camera, SETTINGS) as eye_filter:
         view = RgbdView(picture.color, picture.depth_m, picture.view.tangents)
@@ -72,9 +73,12 @@ def filtered_by_hand(eye, picture):
             pupil_diameter_mm=PUPIL_MM,
             focus_dpt=FOCUS_DPT,
             whole=True,
-            output="linear",
+            output="srgb8" if is_srgb else "linear",
         )
-    return np.rint(255.0 * np.clip(seen.views[0].color, 0.0, 1.0)).astype(int)
+    color = seen.views[0].color
+    if is_srgb:
+        return color.astype(int)
+    return np.rint(255.0 * np.clip(color, 0.0, 1.0)).astype(int)
 
 
 @needs_hello_xr

@@ -1,8 +1,8 @@
 """The mock runtime serves programs, sees what is wrong, and captures what is shown.
 
 Run in the root of `tests/headset/setup_root.sh`, with the packages libopenxr-dev,
-libgl-dev, libegl-dev, libx11-dev, openxr-layer-corevalidation, libopenxr-utils,
-xserver-xorg-core and xserver-xorg-video-dummy.
+libgl-dev, libegl-dev, libvulkan-dev, libx11-dev, openxr-layer-corevalidation,
+libopenxr-utils, xserver-xorg-core and xserver-xorg-video-dummy.
 """
 
 import shutil

@@ -34,6 +34,8 @@ static const struct plan CASES[] = {
     {"fork", "a child process that does nothing, from frame 20 on", .forks = true},
     {"fov-flipped", "angleUp below angleDown", .is_flipped = true},
     {"alpha", "a projection blended by its alpha", .has_alpha = true},
+    {"device-lost", "the layer's calls lose the Vulkan device", .loses_device = true},
+    {"wrong-layout", "images are released in another layout", .breaks_layout = true},
     {"violation", "errors that the runtime must report", .violates = true},
     {"depth-constant", "nothing but 1", .depth = CONSTANT},
     {"depth-nan", "not a number (with Mesa: 0) in every second column",
@@ -54,13 +56,21 @@ static const struct plan CASES[] = {
 
 static const struct {
     const char *name;
-    GLenum format;
+    GLenum opengl;
+    VkFormat vulkan;
 } FORMATS[] = {
-    {"SRGB8_ALPHA8", GL_SRGB8_ALPHA8}, {"RGBA8", GL_RGBA8},
-    {"RGB10_A2", GL_RGB10_A2},         {"RGBA16F", GL_RGBA16F},
-    {"D16", GL_DEPTH_COMPONENT16},     {"D24", GL_DEPTH_COMPONENT24},
-    {"D32F", GL_DEPTH_COMPONENT32F},   {"D24S8", GL_DEPTH24_STENCIL8},
-    {"D32FS8", GL_DEPTH32F_STENCIL8},  {"none", GL_NONE},
+    {"SRGB8_ALPHA8", GL_SRGB8_ALPHA8, VK_FORMAT_R8G8B8A8_SRGB},
+    {"RGBA8", GL_RGBA8, VK_FORMAT_R8G8B8A8_UNORM},
+    {"BGRA8_SRGB", GL_NONE, VK_FORMAT_B8G8R8A8_SRGB},
+    {"BGRA8", GL_NONE, VK_FORMAT_B8G8R8A8_UNORM},
+    {"RGB10_A2", GL_RGB10_A2, VK_FORMAT_A2B10G10R10_UNORM_PACK32},
+    {"RGBA16F", GL_RGBA16F, VK_FORMAT_R16G16B16A16_SFLOAT},
+    {"D16", GL_DEPTH_COMPONENT16, VK_FORMAT_D16_UNORM},
+    {"D24", GL_DEPTH_COMPONENT24, VK_FORMAT_X8_D24_UNORM_PACK32},
+    {"D32F", GL_DEPTH_COMPONENT32F, VK_FORMAT_D32_SFLOAT},
+    {"D24S8", GL_DEPTH24_STENCIL8, VK_FORMAT_D24_UNORM_S8_UINT},
+    {"D32FS8", GL_DEPTH32F_STENCIL8, VK_FORMAT_D32_SFLOAT_S8_UINT},
+    {"none", GL_NONE, VK_FORMAT_UNDEFINED},
 };
 
 enum {
@@ -75,8 +85,6 @@ enum {
 };
 
 struct options options = {.frames = 30,
-                          .color_format = GL_SRGB8_ALPHA8,
-                          .depth_format = GL_DEPTH_COMPONENT32F,
                           .distance_m = 2,
                           .near_z = 0.1f,
                           .far_z = 100};
@@ -85,7 +93,8 @@ struct options options = {.frames = 30,
 
 struct chain {
     XrSwapchain handle;
-    GLuint textures[8];
+    uint64_t images[8];
+    bool is_color;
     uint32_t width, height, layers, samples, index;
     bool is_acquired, is_ahead; /* ahead: the next image is acquired */
     uint32_t next_index;
@@ -128,14 +137,15 @@ static XrAction pose_action;
 static pthread_mutex_t tell_lock = PTHREAD_MUTEX_INITIALIZER;
 
 static void make_chain(const struct session *session, struct chain *chain,
-                       GLenum format, uint32_t width, uint32_t height, uint32_t layers,
+                       int64_t format, uint32_t width, uint32_t height, uint32_t layers,
                        uint32_t samples) {
     bool is_color = format == options.color_format;
     XrSwapchainCreateInfo info = {
         .type = XR_TYPE_SWAPCHAIN_CREATE_INFO,
         .usageFlags = XR_SWAPCHAIN_USAGE_SAMPLED_BIT |
                       (is_color ? XR_SWAPCHAIN_USAGE_COLOR_ATTACHMENT_BIT
-                                : XR_SWAPCHAIN_USAGE_DEPTH_STENCIL_ATTACHMENT_BIT),
+                                : XR_SWAPCHAIN_USAGE_DEPTH_STENCIL_ATTACHMENT_BIT |
+                                      XR_SWAPCHAIN_USAGE_TRANSFER_DST_BIT),
         .format = format,
         .sampleCount = samples,
         .width = width,
@@ -145,16 +155,25 @@ static void make_chain(const struct session *session, struct chain *chain,
         .mipCount = 1,
     };
     *chain = (struct chain){
-        .width = width, .height = height, .layers = layers, .samples = samples};
+        .is_color = is_color, .width = width, .height = height, .layers = layers, .samples = samples};
     MUST(xrCreateSwapchain(session->handle, &info, &chain->handle));
-    XrSwapchainImageOpenGLKHR images[8];
+    union {
+        XrSwapchainImageOpenGLKHR opengl[8];
+        XrSwapchainImageVulkanKHR vulkan[8];
+    } found;
     for (int i = 0; i < 8; i++)
-        images[i] =
-            (XrSwapchainImageOpenGLKHR){.type = XR_TYPE_SWAPCHAIN_IMAGE_OPENGL_KHR};
+        if (options.vulkan)
+            found.vulkan[i] =
+                (XrSwapchainImageVulkanKHR){.type = XR_TYPE_SWAPCHAIN_IMAGE_VULKAN_KHR};
+        else
+            found.opengl[i] =
+                (XrSwapchainImageOpenGLKHR){.type = XR_TYPE_SWAPCHAIN_IMAGE_OPENGL_KHR};
     uint32_t count;
     MUST(xrEnumerateSwapchainImages(chain->handle, 8, &count,
-                                    (XrSwapchainImageBaseHeader *)images));
-    for (uint32_t i = 0; i < count; i++) chain->textures[i] = images[i].image;
+                                    (XrSwapchainImageBaseHeader *)&found));
+    for (uint32_t i = 0; i < count; i++)
+        chain->images[i] = options.vulkan ? (uint64_t)found.vulkan[i].image
+                                          : found.opengl[i].image;
 }
 
 static void make_images(const struct session *session, struct images *images,
@@ -165,7 +184,7 @@ static void make_images(const struct session *session, struct images *images,
     if (plan->depth == SIZE) divisor = 2;
     images->view_count = session->view_count;
     images->chain_count = plan->is_array || plan->is_wide ? 1 : session->view_count;
-    images->has_depth = options.depth_format != GL_NONE;
+    images->has_depth = options.depth_format != 0;
     images->has_alpha = plan->has_alpha;
     uint32_t layers = plan->is_array ? session->view_count : 1;
     uint32_t samples = plan->samples ? plan->samples : 1;
@@ -205,9 +224,13 @@ static void *acquire_ahead(void *given) {
 static void release(struct session *session, struct chain *chain) {
     if (!chain->is_acquired) return;
     pthread_t thread;
-    if (options.plan.acquires_ahead) pthread_create(&thread, NULL, acquire_ahead, chain);
+    /* Two calls that may use the queue are not made at the same time. */
+    if (options.plan.acquires_ahead && options.vulkan) acquire_ahead(chain);
+    else if (options.plan.acquires_ahead) pthread_create(&thread, NULL, acquire_ahead, chain);
+    may_use_queue = true;
     MUST_TIMED(session->release_ms, xrReleaseSwapchainImage(chain->handle, NULL));
-    if (options.plan.acquires_ahead) pthread_join(thread, NULL);
+    may_use_queue = false;
+    if (options.plan.acquires_ahead && !options.vulkan) pthread_join(thread, NULL);
     chain->is_acquired = false;
 }
 
@@ -228,21 +251,39 @@ static XrSwapchainSubImage part_of(const struct plan *plan, const struct chain *
     return part;
 }
 
+static struct vulkan_target target_of(const struct chain *chain, uint32_t layer) {
+    bool is_color = chain->is_color;
+    return (struct vulkan_target){
+        .image = (VkImage)chain->images[chain->index],
+        .format = (VkFormat)(is_color ? options.color_format : options.depth_format),
+        .layer = chain->layers > 1 ? layer : 0,
+        .width = chain->width,
+        .height = chain->height};
+}
+
 /* A shader cannot write what is no number: it is clamped after it.  Mesa also clamps
- * what is uploaded, and stores 0; other drivers store it. */
-static void spoil_depth(const struct chain *chain) {
+ * what is uploaded by OpenGL, and stores 0; other drivers store it.  Noise is drawn by
+ * a shader, except with Vulkan. */
+static void spoil_depth(const struct chain *chain, bool is_noise) {
     size_t count = (size_t)chain->width * chain->height;
     float *values = malloc(count * sizeof *values);
     for (size_t i = 0; i < count; i++)
-        values[i] = i % 2 ? NAN : window_depth(options.distance_m);
-    glBindTexture(GL_TEXTURE_2D, chain->textures[chain->index]);
-    glTexSubImage2D(GL_TEXTURE_2D, 0, 0, 0, (GLsizei)chain->width,
-                    (GLsizei)chain->height, GL_DEPTH_COMPONENT, GL_FLOAT, values);
+        values[i] = is_noise ? (float)rand() / (float)RAND_MAX
+                    : i % 2  ? NAN
+                             : window_depth(options.distance_m);
+    if (options.vulkan) {
+        const struct vulkan_target target = target_of(chain, 0);
+        copy_depth_with_vulkan(&target, values);
+    } else {
+        glBindTexture(GL_TEXTURE_2D, (GLuint)chain->images[chain->index]);
+        glTexSubImage2D(GL_TEXTURE_2D, 0, 0, 0, (GLsizei)chain->width,
+                        (GLsizei)chain->height, GL_DEPTH_COMPONENT, GL_FLOAT, values);
+    }
     free(values);
 }
 
 static void attach_image(GLenum point, const struct chain *chain, uint32_t layer) {
-    attach(point, chain ? chain->textures[chain->index] : 0, chain && chain->layers > 1,
+    attach(point, chain ? (GLuint)chain->images[chain->index] : 0, chain && chain->layers > 1,
            layer);
 }
 
@@ -262,6 +303,14 @@ static void draw_view(const struct plan *plan, const struct images *images,
         .depth = plan->depth == CONSTANT ? 1 : window_depth(distance_m),
     };
     bool has_depth = images->has_depth && depth->is_acquired;
+    if (options.vulkan) {
+        const struct vulkan_target drawn = target_of(color, view);
+        const struct vulkan_target behind = target_of(depth, view);
+        draw_with_vulkan(&picture, &drawn, has_depth ? &behind : NULL);
+        if (has_depth && (plan->depth == NOT_A_NUMBER || plan->depth == GARBAGE))
+            spoil_depth(depth, plan->depth == GARBAGE);
+        return;
+    }
     bool is_apart = has_depth && depth->width != color->width; /* of another size */
     attach_image(GL_COLOR_ATTACHMENT0, color, view);
     attach_image(GL_DEPTH_ATTACHMENT, has_depth && !is_apart ? depth : NULL, view);
@@ -271,7 +320,7 @@ static void draw_view(const struct plan *plan, const struct images *images,
         attach_image(GL_DEPTH_ATTACHMENT, depth, view);
         draw_picture(&picture);
     }
-    if (plan->depth == NOT_A_NUMBER && has_depth) spoil_depth(depth);
+    if (plan->depth == NOT_A_NUMBER && has_depth) spoil_depth(depth, false);
 }
 
 static void draw(struct session *session, const struct plan *plan,
@@ -282,8 +331,10 @@ static void draw(struct session *session, const struct plan *plan,
             acquire(session, &images->depth[i]);
     }
     if (options.check_state) set_usual_state();
-    glEnable(GL_DEPTH_TEST);
-    glDepthFunc(GL_ALWAYS);
+    if (!options.vulkan) {
+        glEnable(GL_DEPTH_TEST);
+        glDepthFunc(GL_ALWAYS);
+    }
     for (uint32_t i = 0; i < images->view_count; i++)
         draw_view(plan, images, i, session->frame);
     if (options.check_state) set_unusual_state();
@@ -297,6 +348,7 @@ static void release_images(struct session *session, struct images *images) {
 }
 
 static void destroy_images(const struct images *images) {
+    if (options.vulkan) forget_vulkan_views();
     for (uint32_t i = 0; i < images->chain_count; i++) {
         MUST(xrDestroySwapchain(images->color[i].handle));
         if (images->has_depth) MUST(xrDestroySwapchain(images->depth[i].handle));
@@ -422,7 +474,9 @@ static XrResult end_frame(struct session *session, const struct layers *layers) 
         .layerCount = layers ? layers->count : 0,
         .layers = layers ? layers->list : NULL,
     };
+    may_use_queue = true;
     XrResult result = TIMED(session->end_ms, xrEndFrame(session->handle, &info));
+    may_use_queue = false;
     /* A runtime may refuse depth that is not valid. */
     if (!options.plan.depth) must(result, "xrEndFrame");
     return result;
@@ -598,7 +652,7 @@ static void show_frame(struct session *session) {
         pthread_join(other, NULL);
         make_current(true);
     } else if (plan->no_context) {
-        glFlush();
+        if (!options.vulkan) glFlush();
         make_current(false);
         finish_frame(session);
         make_current(true);
@@ -718,8 +772,11 @@ static XrResult create_session(struct session *session) {
         .glxFBConfig = graphics.glx_config,
         .glxDrawable = graphics.window,
         .glxContext = graphics.context.glx};
+    XrGraphicsBindingVulkanKHR vulkan = vulkan_binding();
     XrSessionCreateInfo info = {.type = XR_TYPE_SESSION_CREATE_INFO,
-                                .next = options.glx ? (void *)&glx : (void *)&egl,
+                                .next = options.vulkan ? (void *)&vulkan
+                                        : options.glx  ? (void *)&glx
+                                                       : (void *)&egl,
                                 .systemId = the_system};
     memset(session, 0, sizeof *session);
     pthread_mutex_init(&session->lock, NULL);
@@ -873,7 +930,10 @@ static void run(struct session *sessions, int count) {
 /* --- instance -------------------------------------------------------------------- */
 
 static XrResult create_instance(XrInstance *made_instance) {
-    static const char *const WANTED[] = {XR_KHR_OPENGL_ENABLE_EXTENSION_NAME,
+    const char *const WANTED[] = {options.vulkan == 1 ? XR_KHR_VULKAN_ENABLE_EXTENSION_NAME
+                                  : options.vulkan
+                                      ? XR_KHR_VULKAN_ENABLE2_EXTENSION_NAME
+                                      : XR_KHR_OPENGL_ENABLE_EXTENSION_NAME,
                                          XR_MNDX_EGL_ENABLE_EXTENSION_NAME,
                                          XR_KHR_COMPOSITION_LAYER_DEPTH_EXTENSION_NAME,
                                          XR_EXT_EYE_GAZE_INTERACTION_EXTENSION_NAME};
@@ -888,11 +948,11 @@ static XrResult create_instance(XrInstance *made_instance) {
     for (int k = 0; k < 4; k++) {
         for (uint32_t i = 0; i < count; i++)
             has[k] |= !strcmp(offered[i].extensionName, WANTED[k]);
-        bool is_needed = k != 1 || !options.glx;
+        bool is_needed = k != 1 || !(options.glx || options.vulkan);
         if (has[k] && is_needed) enabled[enabled_count++] = WANTED[k];
     }
-    if (!has[0] || (!has[1] && !options.glx))
-        skip("the runtime does not take this kind of context");
+    if (!has[0] || (!has[1] && !options.glx && !options.vulkan))
+        skip("the runtime does not take this graphics API");
     has_depth_extension = has[2];
     has_gaze = has[3];
     XrInstanceCreateInfo info = {
@@ -909,12 +969,16 @@ static void open_instance(void) {
     XrSystemGetInfo info = {.type = XR_TYPE_SYSTEM_GET_INFO,
                             .formFactor = XR_FORM_FACTOR_HEAD_MOUNTED_DISPLAY};
     MUST(xrGetSystem(instance, &info, &the_system));
-    PFN_xrGetOpenGLGraphicsRequirementsKHR ask;
-    MUST(xrGetInstanceProcAddr(instance, "xrGetOpenGLGraphicsRequirementsKHR",
-                               (PFN_xrVoidFunction *)&ask));
-    XrGraphicsRequirementsOpenGLKHR needed = {
-        .type = XR_TYPE_GRAPHICS_REQUIREMENTS_OPENGL_KHR};
-    MUST(ask(instance, the_system, &needed));
+    if (options.vulkan) {
+        open_vulkan(instance, the_system);
+    } else {
+        PFN_xrGetOpenGLGraphicsRequirementsKHR ask;
+        MUST(xrGetInstanceProcAddr(instance, "xrGetOpenGLGraphicsRequirementsKHR",
+                                   (PFN_xrVoidFunction *)&ask));
+        XrGraphicsRequirementsOpenGLKHR needed = {
+            .type = XR_TYPE_GRAPHICS_REQUIREMENTS_OPENGL_KHR};
+        MUST(ask(instance, the_system, &needed));
+    }
     view_type = options.plan.is_mono ? XR_VIEW_CONFIGURATION_TYPE_PRIMARY_MONO
                                      : XR_VIEW_CONFIGURATION_TYPE_PRIMARY_STEREO;
     XrViewConfigurationView views[2] = {{.type = XR_TYPE_VIEW_CONFIGURATION_VIEW},
@@ -950,15 +1014,17 @@ static void run_with_second(struct session *sessions) {
 
 /* --- arguments ------------------------------------------------------------------- */
 
-static GLenum format_of(const char *name) {
+static int64_t format_of(const char *name) {
     for (size_t i = 0; i < LENGTH(FORMATS); i++)
-        if (!strcmp(FORMATS[i].name, name)) return FORMATS[i].format;
+        if (!strcmp(FORMATS[i].name, name))
+            return options.vulkan ? (int64_t)FORMATS[i].vulkan : FORMATS[i].opengl;
     fprintf(stderr, "driver: no format '%s'\n", name);
     exit(2);
 }
 
 static void read_arguments(int count, char **arguments) {
     bool is_case = false;
+    const char *color_format = "SRGB8_ALPHA8", *depth_format = "D32F";
     for (size_t i = 0; i < LENGTH(CASES); i++)
         if (count > 1 && !strcmp(arguments[1], CASES[i].name))
             options.plan = CASES[i], is_case = true;
@@ -970,13 +1036,15 @@ static void read_arguments(int count, char **arguments) {
         if (!strcmp(name, "--glx")) options.glx = true;
         else if (!strcmp(name, "--threads")) options.threads = true;
         else if (!strcmp(name, "--check-state")) options.check_state = true;
+        else if (!strcmp(name, "--validate")) options.validate = true;
         else {
             i++;
             if (!strcmp(name, "--frames")) options.frames = atoi(value);
             else if (!strcmp(name, "--size"))
                 sscanf(value, "%ux%u", &options.width, &options.height);
-            else if (!strcmp(name, "--format")) options.color_format = format_of(value);
-            else if (!strcmp(name, "--depth")) options.depth_format = format_of(value);
+            else if (!strcmp(name, "--vulkan")) options.vulkan = atoi(value);
+            else if (!strcmp(name, "--format")) color_format = value;
+            else if (!strcmp(name, "--depth")) depth_format = value;
             else if (!strcmp(name, "--distance-m"))
                 options.distance_m = strtof(value, NULL);
             else if (!strcmp(name, "--near-z")) options.near_z = strtof(value, NULL);
@@ -987,15 +1055,19 @@ static void read_arguments(int count, char **arguments) {
             }
         }
     }
+    options.color_format = format_of(color_format);
+    options.depth_format = format_of(depth_format);
 }
 
 int main(int count, char **arguments) {
     read_arguments(count, arguments);
     struct session sessions[2];
-    if (options.glx) open_glx();
-    else open_egl();
-    make_current(true);
-    make_drawing();
+    if (!options.vulkan) {
+        if (options.glx) open_glx();
+        else open_egl();
+        make_current(true);
+        make_drawing();
+    }
     if (options.check_state) make_unusual_objects();
     open_instance();
     if (options.check_state) set_unusual_state();
@@ -1003,13 +1075,14 @@ int main(int count, char **arguments) {
         run_with_second(sessions);
     } else {
         for (int i = 0; i < (options.plan.sessions ? options.plan.sessions : 1); i++) {
-            if (!has_context()) make_current(true);
+            if (!options.vulkan && !has_context()) make_current(true);
             MUST(create_session(sessions));
             run(sessions, 1);
         }
     }
     MUST(xrDestroyInstance(instance));
-    close_graphics();
+    if (options.vulkan) close_vulkan();
+    else close_graphics();
     printf(
         "{\"case\": \"%s\", \"frames\": %d, \"timeouts\": %d, "
         "\"checked_state\": %s}\n",

@@ -1,11 +1,14 @@
 /* An OpenXR application that draws known pictures, for tests of an API layer below it.
  *
  *   driver CASE [--frames N] [--size WxH] [--format F] [--depth D] [--distance-m X]
- *          [--near-z X] [--far-z X] [--glx] [--threads] [--check-state]
+ *          [--near-z X] [--far-z X] [--glx] [--vulkan 1|2] [--validate] [--threads]
+ *          [--check-state]
  *
  * CASE is one of `CASES` in driver.c, where it says what each does.  Formats of color:
- * SRGB8_ALPHA8, RGBA8, RGB10_A2, RGBA16F; of depth: D16, D24, D32F, D24S8, D32FS8,
- * none. The depth is that of a plane across the view.  --near-z 100 --far-z 0.1 is
+ * SRGB8_ALPHA8, RGBA8, RGB10_A2, RGBA16F, with Vulkan also BGRA8_SRGB and BGRA8; of
+ * depth: D16, D24, D32F, D24S8, D32FS8, none.  --vulkan names the version of
+ * XR_KHR_vulkan_enable; with --validate, Khronos' validation layer writes what it finds
+ * to standard error. The depth is that of a plane across the view.  --near-z 100 --far-z 0.1 is
  * reversed, and "inf" is infinite.  With --threads a thread waits for the frames.
  *
  * Row y (from the bottom) and column x of view v of frame n are white where
@@ -27,13 +30,16 @@
 #include <GL/glx.h>
 #include <math.h>
 #include <pthread.h>
+#include <stdatomic.h>
 #include <stdbool.h>
 #include <stdint.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
 #include <time.h>
+#include <vulkan/vulkan.h>
 #define XR_USE_GRAPHICS_API_OPENGL
+#define XR_USE_GRAPHICS_API_VULKAN
 #define XR_USE_PLATFORM_XLIB
 #define XR_USE_PLATFORM_EGL
 #include <openxr/openxr.h>
@@ -61,6 +67,7 @@ struct plan {
     bool is_view_locked, in_action_space, renews_space, other_thread, no_context;
     bool ends_from_thread, second, violates;
     bool is_growing, is_hidden, other_context, acquires_ahead, forks;
+    bool loses_device, breaks_layout;
     uint32_t samples;
     int release_every;               /* frames; -1: only the first one */
     int sessions, projections, quad; /* quad: -1 below, 1 above the projection */
@@ -71,9 +78,10 @@ extern struct options {
     struct plan plan;
     int frames;
     uint32_t width, height;
-    GLenum color_format, depth_format;
+    int64_t color_format, depth_format; /* of the API */
     float distance_m, near_z, far_z;
-    bool glx, threads, check_state;
+    bool glx, threads, check_state, validate;
+    int vulkan;
 } options;
 
 /* --- failures.c ------------------------------------------------------------------ */
@@ -165,3 +173,23 @@ void make_drawing(void);
 void draw_picture(const struct picture *picture);
 void attach(GLenum point, GLuint texture, bool is_array, uint32_t layer);
 float window_depth(float z_m);
+
+/* --- vulkan.c -------------------------------------------------------------------- */
+
+/* A layer of an image that is drawn into. */
+struct vulkan_target {
+    VkImage image;
+    VkFormat format;
+    uint32_t layer, width, height;
+};
+
+/* Whether a call is in progress in which a layer may use the queue. */
+extern atomic_bool may_use_queue;
+
+void open_vulkan(XrInstance instance, XrSystemId system);
+void close_vulkan(void);
+XrGraphicsBindingVulkanKHR vulkan_binding(void);
+void forget_vulkan_views(void);
+void draw_with_vulkan(const struct picture *picture, const struct vulkan_target *color,
+                      const struct vulkan_target *depth);
+void copy_depth_with_vulkan(const struct vulkan_target *target, const float *values);

@@ -73,6 +73,7 @@ void open_glx(void) {
 }
 
 void make_current(bool is_current) {
+    if (options.vulkan) return; /* a device belongs to no thread */
     bool done =
         options.glx
             ? glXMakeCurrent(graphics.x_display, is_current ? graphics.window : None,

@@ -85,12 +85,19 @@ static void capture_image(const struct capture *to, const XrSwapchainSubImage *p
             (unsigned long long)swapchain->swapchain.release_count, format->name,
             swapchain->swapchain.info.sampleCount, rect.offset.x, rect.offset.y,
             rect.extent.width, rect.extent.height, part->imageArrayIndex);
-    if (!to->has_pixels) return;
+    bool is_vulkan = swapchain->parent->session.vulkan.device;
+    fprintf(to->file, ", \"usage\": %llu",
+            (unsigned long long)swapchain->swapchain.info.usageFlags);
+    if (!to->has_pixels || (is_vulkan && !can_read_vulkan(swapchain))) return;
     size_t size =
         (size_t)rect.extent.width * (size_t)rect.extent.height * format->pixel_bytes;
     void *pixels = calloc(1, size);
-    read_pixels(swapchain, swapchain->swapchain.released, rect, part->imageArrayIndex,
-                pixels, (GLsizei)size);
+    int released = swapchain->swapchain.released;
+    if (is_vulkan)
+        read_vulkan_pixels(swapchain, released, rect, part->imageArrayIndex, pixels);
+    else
+        read_pixels(swapchain, released, rect, part->imageArrayIndex, pixels,
+                    (GLsizei)size);
     char name[64], path[4096];
     snprintf(name, sizeof name, "%06lld_%u_%u_%s.bin", (long long)to->number, to->layer,
              view, what);
@@ -169,8 +176,12 @@ void capture_frame(struct object *session, const XrFrameEndInfo *info) {
         fprintf(stderr, "mock: %s: %s\n", path, strerror(errno));
         return;
     }
-    struct borrowed saved = borrow();
-    to.has_pixels = set_current(&session->session.own) && to.has_pixels;
+    bool is_vulkan = session->session.vulkan.device;
+    struct borrowed saved = {0};
+    if (!is_vulkan) {
+        saved = borrow();
+        to.has_pixels = set_current(&session->session.own) && to.has_pixels;
+    }
     fprintf(to.file,
             "{\"frame\": %lld, \"session\": %llu, \"display_time\": %lld, "
             "\"predicted_display_time\": %lld, \"layers\": [",
@@ -180,5 +191,5 @@ void capture_frame(struct object *session, const XrFrameEndInfo *info) {
         capture_layer(&to, info->layers[to.layer]);
     fprintf(to.file, "]}\n");
     fclose(to.file);
-    give_back(&saved);
+    if (!is_vulkan) give_back(&saved);
 }

@@ -39,8 +39,14 @@ void give_back(const struct borrowed *saved) {
     eglBindAPI(saved->api);
 }
 
-/* Wait for the application's commands, in its context. */
+/* Wait for the application's commands, in its context or queue. */
 XrResult finish_application(struct object *session) {
+    if (session->session.vulkan.device) {
+        VkResult result = vkQueueWaitIdle(session->session.vulkan.queue);
+        REQUIRE(result == VK_SUCCESS, XR_ERROR_RUNTIME_FAILURE, "the queue failed: %d",
+                (int)result);
+        return XR_SUCCESS;
+    }
     struct borrowed saved = borrow();
     bool is_ours = set_current(&session->session.application);
     if (is_ours) glFinish();

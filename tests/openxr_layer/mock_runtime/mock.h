@@ -4,7 +4,8 @@
  * of the specification and a line "mock: violation: FUNCTION: ..." on standard error.
  * Its swapchain images are textures of OpenGL, made in a context of its own that shares
  * with the application's; like Monado, it makes the application's context current where
- * it has to wait for its commands, and restores what was current.
+ * it has to wait for its commands, and restores what was current.  For applications that
+ * use Vulkan, they are images on the application's device.
  *
  * Environment (numbers of frames count xrWaitFrame in this process, from 0):
  *   MOCK_XR_EXTENSIONS     offered, separated by commas or spaces (all it knows)
@@ -41,21 +42,33 @@
 #include <string.h>
 #include <time.h>
 #define XR_EXTENSION_PROTOTYPES
+#include <vulkan/vulkan.h>
 #define XR_USE_GRAPHICS_API_OPENGL
+#define XR_USE_GRAPHICS_API_VULKAN
 #define XR_USE_PLATFORM_XLIB
 #define XR_USE_PLATFORM_EGL
 #include <openxr/openxr.h>
 #include <openxr/openxr_platform.h>
 
 enum { N_IMAGES = 3, MAX_LAYERS = 16, MAX_SIZE_PX = 8192, MAX_ACTION_SETS = 16 };
-enum { OPENGL, EGL, DEPTH, GAZE, DEBUG_UTILS, N_EXTENSIONS };
+enum { OPENGL, EGL, VULKAN, VULKAN2, DEPTH, GAZE, DEBUG_UTILS, N_EXTENSIONS };
 static const XrPosef IDENTITY = {{0, 0, 0, 1}, {0, 0, 0}};
 
 struct format {
     const char *name;
     GLenum internal, layout, type; /* the last two: of its pixels in a file */
-    unsigned pixel_bytes;
+    unsigned pixel_bytes; /* in a file; depth: a float */
     bool is_depth;
+    VkImageAspectFlags aspects;
+    unsigned stored_bytes; /* of a pixel of Vulkan's */
+};
+
+/* The application's device. */
+struct vulkan {
+    VkPhysicalDevice physical_device;
+    VkDevice device; /* NULL: it uses OpenGL */
+    VkQueue queue;
+    VkCommandPool pool;
 };
 
 /* What a thread has current: a context of EGL, one of GLX or none. */
@@ -91,6 +104,7 @@ struct object {
         struct {
             struct current application, own;
             GLXPbuffer pbuffer;
+            struct vulkan vulkan;
             XrSessionState state;
             bool is_running, is_lost, in_frame, has_actions, is_synced;
             uint32_t view_count;
@@ -109,6 +123,9 @@ struct object {
             XrSwapchainCreateInfo info;
             const struct format *format;
             GLuint textures[N_IMAGES];
+            VkImage images[N_IMAGES];
+            VkDeviceMemory memories[N_IMAGES];
+            bool is_ready[N_IMAGES]; /* they have a layout */
             uint32_t image_count, acquired_count, waited_count;
             uint32_t acquired[N_IMAGES]; /* oldest first; the first may be waited for */
             uint32_t next;
@@ -211,6 +228,19 @@ void leave(int *unused);
 
 /* Hold the lock until the function returns. */
 #define ENTER __attribute__((cleanup(leave), unused)) int entered = enter(__func__)
+
+/* --- vulkan.c --------------------------------------------------------------------- */
+
+extern const struct format VULKAN_FORMATS[];
+extern const size_t N_VULKAN_FORMATS;
+XrResult bind_vulkan(struct object *session, const XrGraphicsBindingVulkanKHR *given);
+void unbind_vulkan(struct object *session);
+bool make_vulkan_images(struct object *swapchain);
+void destroy_vulkan_images(struct object *swapchain);
+void ready_vulkan_image(struct object *swapchain, uint32_t index);
+bool can_read_vulkan(const struct object *swapchain);
+void read_vulkan_pixels(const struct object *swapchain, int image, XrRect2Di part,
+                        uint32_t layer, void *pixels);
 
 /* --- the other files ------------------------------------------------------------- */
 

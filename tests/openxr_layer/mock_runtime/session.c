@@ -105,25 +105,35 @@ XrResult XRAPI_CALL xrCreateSession(XrInstance instance,
     FIND(parent, INSTANCE, instance);
     STRUCTURE(info, XR_TYPE_SESSION_CREATE_INFO,
               XR_TYPE_GRAPHICS_BINDING_OPENGL_XLIB_KHR,
-              XR_TYPE_GRAPHICS_BINDING_EGL_MNDX);
+              XR_TYPE_GRAPHICS_BINDING_EGL_MNDX, XR_TYPE_GRAPHICS_BINDING_VULKAN_KHR);
     REQUIRE_SYSTEM(info->systemId);
-    REQUIRE(mock.is_enabled[OPENGL], XR_ERROR_GRAPHICS_DEVICE_INVALID,
-            "OpenGL is not enabled");
+    const void *vulkan =
+        chained_structure(info->next, XR_TYPE_GRAPHICS_BINDING_VULKAN_KHR);
+    REQUIRE(vulkan ? mock.is_enabled[VULKAN] || mock.is_enabled[VULKAN2]
+                   : mock.is_enabled[OPENGL],
+            XR_ERROR_GRAPHICS_DEVICE_INVALID, "the graphics API is not enabled");
     REQUIRE(parent->instance.has_asked_for_requirements,
             XR_ERROR_GRAPHICS_REQUIREMENTS_CALL_MISSING,
-            "xrGetOpenGLGraphicsRequirementsKHR was not called");
+            "the graphics requirements were not asked for");
     const void *egl = chained_structure(info->next, XR_TYPE_GRAPHICS_BINDING_EGL_MNDX);
     const void *glx =
         chained_structure(info->next, XR_TYPE_GRAPHICS_BINDING_OPENGL_XLIB_KHR);
-    REQUIRE(egl || glx, XR_ERROR_GRAPHICS_DEVICE_INVALID, "there is no binding");
+    REQUIRE(egl || glx || vulkan, XR_ERROR_GRAPHICS_DEVICE_INVALID,
+            "there is no binding");
     struct object *made = create(SESSION, parent);
-    struct borrowed saved = borrow();
-    XrResult result = egl ? bind_egl(made, egl) : bind_glx(made, glx);
-    give_back(&saved);
+    XrResult result;
+    if (vulkan) {
+        result = bind_vulkan(made, vulkan);
+    } else {
+        struct borrowed saved = borrow();
+        result = egl ? bind_egl(made, egl) : bind_glx(made, glx);
+        give_back(&saved);
+    }
     made->is_alive = result == XR_SUCCESS;
     if (result != XR_SUCCESS) return result;
     const struct current *application = &made->session.application;
-    know_context(application->egl ? application->egl : (void *)application->glx);
+    if (!vulkan)
+        know_context(application->egl ? application->egl : (void *)application->glx);
     enter_state(made, XR_SESSION_STATE_IDLE);
     enter_state(made, XR_SESSION_STATE_READY);
     *session = HANDLE(XrSession, made);
@@ -137,6 +147,7 @@ void destroy_session(struct object *session) {
         mock.objects[i]->is_alive = false;
     }
     struct current *own = &session->session.own;
+    if (session->session.vulkan.device) unbind_vulkan(session);
     if (own->egl) eglDestroyContext(own->egl_display, own->egl);
     if (own->glx) {
         glXDestroyContext(own->glx_display, own->glx);
