@@ -7,14 +7,25 @@ page, links and new pages take everything else from the line.
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
-from clients.web.written import DEGREE, written_number
-from clients.web.written import prescription_texts as prescription_texts
+from estimator.dynamics import steady_pupil_mm
 
-HIDDEN = 0.05
-"""Fraction of a number without decimals that is not shown."""
+DEGREE = "°"
+MINUS_SIGNS = str.maketrans({"\N{MINUS SIGN}": "-", "\N{EN DASH}": "-", ",": "."})
+
+_POWER = r"([+-]?\d+(?:\.\d+)?)"
+_PRESCRIPTION = re.compile(
+    rf"{_POWER}\s*(?:[/;]\s*|\s+|(?=[+-])){_POWER}\s*"
+    r"(?:[x×*@/;]|ax(?:is|e)?\.?|\s)\s*(\d{1,3})\s*°?",
+    re.IGNORECASE | re.ASCII,
+)
+
+
+METERS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "ft": 0.3048, "in": 0.0254}
+_DISTANCE = re.compile(r"(\d*\.?\d+)\s*(m|cm|mm|ft|in)", re.IGNORECASE | re.ASCII)
 
 
 @dataclass(frozen=True)
@@ -59,7 +70,7 @@ class NumberField:
         return limits.replace("-", "\N{MINUS SIGN}")
 
     def read(self, text: str) -> float:
-        """Return the number in a text as people write it; see `written_number`.
+        """Return the number in a text; a comma may be the decimal point.
 
         Raises
         ------
@@ -70,14 +81,33 @@ class NumberField:
         shown = text.strip()
         if not shown:
             raise ValueError(f"{self.label} is empty; allowed: {self.allowed}")
-        value = written_number(
-            shown, unit=self.unit, is_vertex=self.name == "vertex_mm"
-        )
+        try:
+            value = float(shown.translate(MINUS_SIGNS))
+        except ValueError:
+            value = math.nan
         if not math.isfinite(value):
             raise ValueError(f"“{shown:.20}” is not a number; allowed: {self.allowed}")
         if not self.low <= value <= self.high:
             raise ValueError(f"{shown:.20} is out of range; allowed: {self.allowed}")
         return value
+
+    def read_typed(self, text: str) -> float:
+        """Return the value of a text that may have a unit, as "6 m" or "3.5 mm".
+
+        Raises
+        ------
+        ValueError
+            If it has no value within the range; the message contains the text and the
+            allowed range.
+        """
+        shown = text.strip().translate(MINUS_SIGNS)
+        if self.is_distance:
+            meters = _DISTANCE.fullmatch(shown)
+            if meters is not None:
+                length = float(meters[1]) * METERS[meters[2].lower()]
+                shown = f"{1.0 / length:.4f}" if length > 0.0 else "inf"
+            shown = re.sub(r"\s*(dpt|D)$", "", shown)
+        return self.read(shown.removesuffix(self.unit).strip())
 
     def problem(self, text: str) -> str | None:
         """Return the error message for a text, or None."""
@@ -94,10 +124,7 @@ class NumberField:
     def show(self, value: float) -> str:
         """Return a value as displayed in an entry."""
         sign = "+" if self.is_signed and value > 0 else ""
-        digits = self.digits
-        if not digits and abs(value - round(value)) >= HIDDEN:
-            digits = 1  # 12.5 mm as typed
-        return f"{sign}{value:.{digits}f}"
+        return f"{sign}{value:.{self.digits}f}"
 
     def normalized(self, text: str, steps: int = 0) -> str:
         """Return a valid text as displayed, "-4" as "-4.00"; others unchanged.
@@ -133,8 +160,27 @@ DISTANCE = NumberField(
 GAZE_H = NumberField("gaze_h_deg", "Gaze, right", "°", -20.0, 20.0, 1.0, digits=0)
 GAZE_V = NumberField("gaze_v_deg", "Gaze, up", "°", -45.0, 30.0, 1.0, digits=0)
 AGE = NumberField("age_years", "Age", "years", 5.0, 90.0, 1.0, 30.0, digits=0)
-CONDITIONS = (PUPIL, FOCUS, DISTANCE, GAZE_H, GAZE_V, AGE)
+AGE_B = replace(AGE, name="age_b_years", label="Age of B")
+CONDITIONS = (PUPIL, FOCUS, DISTANCE, GAZE_H, GAZE_V, AGE, AGE_B)
 """Viewing conditions, in the order of the page."""
+
+DISTANCES_M = {"6 m": 6.0, "4 m": 4.0, "1 m": 1.0, "66 cm": 0.66, "40 cm": 0.4}
+"""Distances of charts and of reading, as people say them."""
+
+BY_HAND = "hand"
+LIGHTS: dict[str, tuple[str, float]] = {
+    BY_HAND: ("Pupil as set by the slider", 0.0),
+    "moon": ("Moonlit street, 0.03 cd/m²", 0.03),
+    "night": ("Lit road at night, 1 cd/m²", 1.0),
+    "room": ("Living room, 30 cd/m²", 30.0),
+    "screen": ("Letter chart or screen, 100 cd/m²", 100.0),
+    "overcast": ("Overcast day, 2,000 cd/m²", 2000.0),
+    "sun": ("Sunny day, 8,000 cd/m²", 8000.0),
+}
+"""Levels of light: text, and mean luminance in cd/m²."""
+
+LIT_FIELD_DEG2 = 2827.0
+"""Area of the adapting field: a disk of 60 deg."""
 
 SPHERE = NumberField("sphere_dpt", "Sphere", "dpt", -30.0, 30.0, 0.25, is_signed=True)
 CYLINDER = replace(SPHERE, name="cylinder_dpt", label="Cylinder", low=-15.0, high=15.0)
@@ -154,18 +200,6 @@ MIDDLE_ADD = NumberField(
     "middle_add_dpt", "Middle add", "dpt", 0.5, 6.0, 0.01, 1.66, is_signed=True
 )
 NEAR_ADD = replace(MIDDLE_ADD, name="near_add_dpt", label="Near add", initial=3.32)
-RESIDUAL_SPHERE = NumberField(
-    *("residual_sphere_dpt", "Residual sphere", "dpt", -10.0, 10.0, 0.25),
-    is_signed=True,
-)
-RESIDUAL_CYLINDER = replace(
-    RESIDUAL_SPHERE, name="residual_cylinder_dpt", label="Residual cylinder"
-)
-RESIDUAL_AXIS = replace(AXIS, name="residual_axis_deg", label="Residual axis")
-RESIDUAL = (RESIDUAL_SPHERE, RESIDUAL_CYLINDER, RESIDUAL_AXIS)
-"""Refraction that remains after surgery, at the cornea."""
-
-STRAYLIGHT = NumberField("log_s", "log s at 7°", "", 0.5, 2.5, 0.05, 1.2)
 ABERRATION = NumberField(
     *("spherical_aberration_um", "C(4,0), 6 mm", "µm", -2.0, 2.0, 0.01),
     is_signed=True,
@@ -173,7 +207,6 @@ ABERRATION = NumberField(
 CORRECTION = (
     *PRESCRIPTION,
     *(PROGRESSIVE_ADD, CORRIDOR, MIDDLE_ADD, NEAR_ADD, ABERRATION),
-    *RESIDUAL,
 )
 """All entries of corrections."""
 
@@ -181,6 +214,18 @@ CORRECTION = (
 def initial_values() -> dict[str, float]:
     """Return the initial viewing conditions."""
     return {field.name: field.initial for field in CONDITIONS}
+
+
+def pupil_by_light_mm(light: str, age_years: float) -> float:
+    """Return the pupil at a level of light, within the range of its slider.
+
+    References
+    ----------
+    Watson & Yellott, J. Vision 12(10):12, 2012: the "unified formula".
+    """
+    _, luminance_cd_m2 = LIGHTS[light]
+    found_mm = steady_pupil_mm(luminance_cd_m2, LIT_FIELD_DEG2, age_years)
+    return round(PUPIL.clamped(found_mm), PUPIL.digits)
 
 
 def initial_texts(fields: Iterable[NumberField]) -> dict[str, str]:
@@ -195,3 +240,12 @@ def distance_text(vergence_dpt: float) -> str:
     meters = 1.0 / vergence_dpt
     distance = f"{100 * meters:.0f} cm" if meters < 1.0 else f"{meters:.1f} m"
     return f"{vergence_dpt:.2f} dpt · {distance}"
+
+
+def prescription_texts(text: str) -> tuple[str, str, str] | None:
+    """Return sphere, cylinder and axis of a text as "-3.5 -1.25 x 80".
+
+    None if the text has another form.
+    """
+    found = _PRESCRIPTION.fullmatch(text.strip().translate(MINUS_SIGNS))
+    return None if found is None else (found[1], found[2], found[3])

@@ -3,41 +3,34 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Collection
 from functools import partial
 from typing import Any
 
 from nicegui import events, ui
 
+from clients.web.comparison import CORRECTION_PREFIX, EyeName
 from clients.web.controls import (
     AXIS,
     CYLINDER,
     PRESCRIPTION,
     SPHERE,
     SPHERE_SLIDER,
-    STRAYLIGHT,
     NumberField,
     prescription_texts,
 )
 from clients.web.eye_form import (
     DESIGNS,
     DISTANCE_KINDS,
-    HAZES,
     HINTS,
     SIDES,
-    YELLOWINGS,
     EyeForm,
-    EyeSide,
     preset_titles,
 )
-from clients.web.widgets import SliderRow, select, title, toggle, upload_entry
+from clients.web.widgets import SliderRow, select, switch, title, toggle, upload_entry
 from estimator import MAX_PROFILE_BYTES, PROFILE_SUFFIXES
 
 SOURCES = {"prescription": "Prescription", "preset": "Preset", "file": "File"}
-
-NO_HIGHER_ORDER = (
-    "Without aberrations of the age: the prescription is that after lens surgery."
-)
 
 TYPING_MS = 400
 """Pause after which a typed number is used; an incomplete one would be another eye."""
@@ -46,27 +39,31 @@ ChangeHandler = Callable[[events.ValueChangeEventArguments], None]
 
 
 class EyePanel:
-    """Entries of one eye, which update its form.
+    """Entries of one eye or of one of its states, which update its form.
 
     Parameters
     ----------
+    name : of the eye or state
     on_change : called when the entries have changed and are valid
     on_file : called with the eye, and the name and content of an uploaded profile file
     """
 
     def __init__(
         self,
+        name: EyeName,
         form: EyeForm,
         on_change: Callable[[], None],
-        on_file: Callable[[EyeSide, str, bytes], Awaitable[None]],
+        on_file: Callable[[EyeName, str, bytes], Awaitable[None]],
     ) -> None:
-        self.form = form
+        self.name, self.form = name, form
         self._on_change, self._on_file = on_change, on_file
         self._entries: dict[tuple[str, bool], ui.input] = {}
+        self._choices: dict[str, ui.element] = {}  # by profile field
+        self._marked: Collection[str] = ()
         with ui.element("div").classes("oc-eye-box") as self.box:
             self.heading = title(SIDES[form.side], "h3", "oc-eye-title")
             with ui.element("div").classes("oc-eye") as entries:
-                entries.props["data-eye-panel"] = form.side
+                entries.props["data-eye-panel"] = name
                 self.build()
 
     @ui.refreshable_method
@@ -74,7 +71,8 @@ class EyePanel:
         """Show the entries of the form."""
         form = self.form
         self._entries.clear()
-        toggle(
+        self._choices.clear()
+        self._choices["kind"] = toggle(
             SOURCES,
             form.source,
             self._takes(partial(setattr, form, "source")),
@@ -84,19 +82,33 @@ class EyePanel:
         if form.source == "prescription":
             self._prescription()
         elif form.source == "preset":
-            select(
-                preset_titles(),
-                form.preset,
-                self._takes(form.choose_preset),
-                label="Preset",
-            ).classes("oc-wide").mark("preset")
+            self._choices["name"] = (
+                select(
+                    preset_titles(),
+                    form.preset,
+                    self._takes(partial(setattr, form, "preset"), rebuilds=False),
+                    label="Preset",
+                )
+                .classes("oc-wide")
+                .mark("preset")
+            )
         else:
             self._file()
         if form.loaded_name and form.source != "file":
             ui.label(f"Loaded: {form.loaded_name}").classes("oc-hint")
-        self._media()
         ui.separator()
         self._correction()
+        self.mark(self._marked)
+
+    def mark(self, paths: Collection[str]) -> None:
+        """Mark the entries of some profile fields: those that differ from A to B."""
+        self._marked = paths
+        elements = {
+            f"{CORRECTION_PREFIX if is_worn else ''}{field}": entry
+            for (field, is_worn), entry in self._entries.items()
+        }
+        for path, element in (elements | self._choices).items():
+            element.classes(**{"add" if path in paths else "remove": "oc-differs"})
 
     def _prescription(self) -> None:
         form = self.form
@@ -112,14 +124,9 @@ class EyePanel:
             sphere.on_value_change(lambda event: slider.show(_position(event.value)))
             for number in PRESCRIPTION[1:]:
                 self._entry(number, form.texts)
-        if form.applies_higher_order:
-            self._switch(
-                "Higher-order aberrations of this age",
-                "has_higher_order",
-                rebuilds=False,
-            )
-        else:
-            ui.label(NO_HIGHER_ORDER).classes("oc-hint")
+        self._choices["higher_order"] = self._switch(
+            "Higher-order aberrations of this age", "has_higher_order", rebuilds=False
+        )
 
     def _entry(
         self, number: NumberField, texts: dict[str, str], *, is_worn: bool = False
@@ -178,32 +185,17 @@ class EyePanel:
         form, suffixes = self.form, ", ".join(PROFILE_SUFFIXES)
         upload_entry(
             *("Profile", ",".join(PROFILE_SUFFIXES), MAX_PROFILE_BYTES),
-            lambda name, content: self._on_file(form.side, name, content),
+            lambda name, content: self._on_file(self.name, name, content),
         ).classes("oc-wide").mark("profile-file")
         text = f"In use: {form.file_name}" if form.file_name else ""
         ui.label(text or f"A profile: {suffixes}").classes("oc-hint")
 
-    def _media(self) -> None:
-        """Show the entries of straylight and yellowing."""
-        form = self.form
-        with ui.element("div").classes("oc-fields"):
-            for options, name, label in (
-                (HAZES, "haze", "Straylight"),
-                (YELLOWINGS, "yellowing", "Yellowing"),
-            ):
-                select(
-                    options,
-                    getattr(form, name),
-                    self._takes(partial(setattr, form, name)),
-                    label=label,
-                ).classes("oc-wide").mark(name)
-            if form.haze == "measured":
-                self._entry(STRAYLIGHT, form.media_texts)
-
     def _correction(self) -> None:
         form, worn = self.form, self.form.worn
         with ui.element("div").classes("oc-line"):
-            self._switch("Wears a correction", "wears_correction")
+            self._choices["correction"] = self._switch(
+                "Wears a correction", "wears_correction"
+            )
             can_correct = not form.wears_correction or worn.kind in DISTANCE_KINDS
             if form.source == "prescription" and can_correct:
                 ui.button("Correct fully", on_click=self._correct_fully).props(
@@ -211,11 +203,11 @@ class EyePanel:
                 ).tooltip("Wear the prescription above; keep kind of lens and addition")
         if not form.wears_correction:
             return
-        select(
+        self._choices["correction.kind"] = select(
             worn.kinds, worn.kind, self._takes(form.choose_worn), label="Correction"
         ).classes("oc-wide oc-worn-kind")
         if worn.kind == "iol":
-            select(
+            self._choices["correction.design"] = select(
                 DESIGNS,
                 worn.design,
                 self._takes(partial(setattr, worn, "design")),
@@ -228,12 +220,9 @@ class EyePanel:
         if worn.kind in HINTS:
             ui.label(HINTS[worn.kind]).classes("oc-hint")
 
-    def _switch(self, label: str, name: str, *, rebuilds: bool = True) -> None:
-        ui.switch(
-            label,
-            value=getattr(self.form, name),
-            on_change=self._takes(partial(setattr, self.form, name), rebuilds=rebuilds),
-        ).props("dense").classes("oc-switch")
+    def _switch(self, label: str, name: str, *, rebuilds: bool = True) -> ui.switch:
+        take = self._takes(partial(setattr, self.form, name), rebuilds=rebuilds)
+        return switch(label, getattr(self.form, name), take)
 
     # Event handlers
 

@@ -11,30 +11,72 @@ from typing import Any
 from nicegui import events, ui
 
 from clients.scenes.letter_chart import smallest_row
+from clients.web.comparison import EyeName
 from clients.web.controls import DISTANCE, distance_text
-from clients.web.eye_form import SIDES, EyeSide
 from clients.web.figure_worker import (
     FIGURE_TITLES,
     Ask,
     FigureFailed,
-    eye_figure,
+    eye_figures,
     point_spread,
     predicted_log_mar,
 )
 from clients.web.page_state import PageState
-from clients.web.widgets import card, title, toggle
+from clients.web.widgets import card, help_button, title, toggle
 
 WIDTHS_ARCMIN = {
-    "a stroke of the 1.0 (20/20) line": 1.0,
+    "half a stroke of a letter of the 1.0 (20/20) line": 0.5,
+    "two thirds of a stroke of a letter of the 1.0 (20/20) line": 0.7,
+    "a stroke of a letter of the 1.0 (20/20) line": 1.0,
+    "a stroke of a letter of the 0.7 (20/29) line": 1.4,
+    "a stroke of a letter of the 0.5 (20/40) line": 2.0,
+    "a stroke of a letter of the 0.35 (20/57) line": 2.8,
+    "a stroke of a letter of the 0.25 (20/80) line": 4.0,
     "a letter of the 1.0 (20/20) line": 5.0,
+    "a letter of the 0.7 (20/29) line": 7.0,
     "a letter of the 0.5 (20/40) line": 10.0,
+    "a letter of the 0.35 (20/57) line": 14.0,
+    "a letter of the 0.25 (20/80) line": 20.0,
     "the full moon": 31.0,
+    "one and a half full moons": 45.0,
     "a little finger at arm's length": 60.0,
+    "one and a half little fingers at arm's length": 90.0,
     "a thumb at arm's length": 120.0,
+    "one and a half thumbs at arm's length": 180.0,
+    "two thumbs at arm's length": 240.0,
     "three fingers at arm's length": 300.0,
+    "four fingers at arm's length": 420.0,
     "a fist at arm's length": 600.0,
+    "one and a half fists at arm's length": 900.0,
+    "a spread hand at arm's length": 1200.0,
 }
-"""Visual angles of familiar objects."""
+"""Visual angles of familiar things, in steps of at most 1.5."""
+
+LEAST_OFFSET_DEG = 0.05
+
+POINT_HELP = (
+    "The image of a single point of light on the retina, at the pointer. The smaller "
+    "the spot, the sharper the sight. A normal eye is sharpest where it looks; toward "
+    "the side, the image blurs, which one does not notice, because the retina resolves "
+    "little there. Colors separate because the eye focuses blue nearer than red."
+)
+FIGURES_HELP = (
+    "Figures of the eye as the report has them. Click a figure to enlarge it. Two eyes "
+    "or states are drawn in one diagram or beside each other."
+)
+FIGURE_TEXTS = {
+    "wavefront": "Deviation of the light from a perfect focus over the pupil: the more "
+    "even the color, the sharper the image. RMS is its mean size; below 0.07 µm the "
+    "image of a point hardly differs from a perfect one.",
+    "field": "Refraction and blur by direction, as the person sees the surroundings. "
+    "The center is where the person looks. Blur toward the side is normal.",
+    "section": "The eye from the side, with the lens and the rays of a far point.",
+    "acuity": "Predicted acuity by distance: higher is better. 0.0 logMAR is 1.0, "
+    "20/20 or 6/6. It is a prediction from optics for a healthy retina.",
+    "contrast": "Share of the contrast of a grating that reaches the retina: coarse "
+    "patterns at the left, fine ones at the right. 30 cycles per degree is the detail "
+    "of the 1.0 (20/20) line.",
+}
 
 
 class FigurePanel:
@@ -47,7 +89,7 @@ class FigurePanel:
 
     def __init__(self, state: PageState, ask: Ask) -> None:
         self._state, self._ask = state, ask
-        self._side: EyeSide = "OD"
+        self._name: EyeName = "OD"
         self._at = (0.5, 0.5)
         self._figure = next(iter(FIGURE_TITLES))
         self._drawn_request: Any = None
@@ -59,15 +101,23 @@ class FigurePanel:
     def build_point(self) -> None:
         """Build the point-spread function card."""
         with card("Point of light", "oc-point"):
-            title("How a point of light looks here")
-            self._psf = self._picture_button("oc-psf", "the point of light")
+            with ui.element("div").classes("oc-line"):
+                title("How a point of light looks here")
+                help_button("a point of light", POINT_HELP)
+            with ui.element("div").classes("oc-points"):
+                self._psfs = [
+                    self._picture_button("oc-psf", what)
+                    for what in ("the point of light", "the point of light in B")
+                ]
             self._message = ui.label("Move the pointer over the picture.")
             self._message.classes("oc-hint")
 
     def build_figure(self) -> None:
         """Build the figure card."""
         with card("Figures"):
-            self._title = title("Figures")
+            with ui.element("div").classes("oc-line"):
+                self._title = title("Figures")
+                help_button("the figures", FIGURES_HELP)
             toggle(
                 FIGURE_TITLES,
                 self._figure,
@@ -76,7 +126,10 @@ class FigurePanel:
                 props="spread",
                 kind="oc-figures",
             )
-            self._image = self._picture_button("oc-figure", "the figure")
+            with ui.element("div").classes("oc-figure-row"):
+                self._image = self._picture_button("oc-figure", "the figure")
+                self._explanation = ui.label(FIGURE_TEXTS[self._figure])
+                self._explanation.classes("oc-hint oc-explanation")
 
     def _picture_button(self, kind: str, what: str) -> ui.html:
         """Create a placeholder for an image that opens enlarged when clicked."""
@@ -93,20 +146,19 @@ class FigurePanel:
             self._large.content = image_slot.content
             self._enlarged.open()
 
-    async def point(self, side: EyeSide, x: float, y: float) -> None:
+    async def point(self, name: EyeName, x: float, y: float) -> None:
         """Show the point-spread function at a position in the picture."""
-        self._side, self._at = side, (x, y)
+        self._name, self._at = name, (x, y)
         await self._show_point()
 
     async def refresh(self) -> None:
         """Redraw everything after a change of the eye or its state."""
-        if self._side not in self._state.sides:
-            self._side = self._state.sides[0]
         await self._show_point()
         await self._show_figure()
 
     async def _choose(self, event: events.ValueChangeEventArguments) -> None:
         self._figure = event.value
+        self._explanation.text = FIGURE_TEXTS[self._figure]
         await self._show_figure()
 
     async def _answer(
@@ -122,30 +174,45 @@ class FigurePanel:
             self._message.text = str(error)
             return None
 
-    def _body(self, side: EyeSide) -> str | None:
+    def _body(self, name: EyeName) -> str | None:
         """Return an eye's profile as JSON, the cache key of the worker."""
-        body = self._state.profile_at_gaze(side)
+        body = self._state.profile_at_gaze(name)
         return None if body is None else json.dumps(body, sort_keys=True)
 
     async def _show_point(self) -> None:
-        body, picture = self._body(self._side), self._state.picture
-        if body is None or picture is None:
-            return
-        scene_point = picture.scene_point(*self._at)
-        answer = await self._answer(
-            "point",
-            point_spread,
-            body,
-            direction_deg=scene_point.direction_deg(self._state.picture_gaze_deg),
-            object_dpt=scene_point.distance_dpt,
-            **self._state.eye_state,
-        )
-        if answer is not None:
+        """Show the point of light of the eye at the pointer, or of both states."""
+        state = self._state
+        names = state.names if state.is_comparing else (self._name,)
+        if names[0] not in state.names:
+            names = state.names[:1]
+        for psf in self._psfs[len(names) :]:
+            psf.content = ""
+        messages: list[str] = []
+        for name, psf in zip(names, self._psfs, strict=False):
+            body, picture = self._body(name), state.picture
+            if body is None or picture is None:
+                return
+            scene_point = picture.scene_point(*self._at)
+            answer = await self._answer(
+                f"point {len(messages)}",
+                point_spread,
+                body,
+                direction_deg=scene_point.direction_deg(state.picture_gaze_deg),
+                object_dpt=scene_point.distance_dpt,
+                **state.eye_state,
+            )
+            if answer is None:
+                return
             png, facts = answer
-            self._psf.content = _image(png, "Image of the point of light")
-            self._message.text = describe_point(facts)
+            shown = state.title(name)
+            psf.content = _image(png, f"Image of the point of light, {shown}")
+            start = f"{shown}: " if state.is_comparing else ""
+            if not messages:
+                start = f"{describe_place(facts)} {start}"
+            messages.append(start + describe_width(facts))
+        self._message.text = "\n".join(messages)
 
-    async def smallest_rows(self) -> dict[EyeSide, int | None] | None:
+    async def smallest_rows(self) -> dict[EyeName, int | None] | None:
         """Return the smallest chart row that each eye can read; None if it reads none.
 
         Return None if a request failed or was superseded.  An eye whose acuity is
@@ -153,13 +220,13 @@ class FigurePanel:
         """
         picture = self._state.picture
         rows = [row.log_mar for row in picture.chart_rows] if picture else []
-        found: dict[EyeSide, int | None] = {}
-        for side in self._state.sides if rows else ():
-            body = self._body(side)
+        found: dict[EyeName, int | None] = {}
+        for name in self._state.names if rows else ():
+            body = self._body(name)
             if body is None:
                 continue
             log_mar = await self._answer(
-                f"acuity {side}",
+                f"acuity {name}",
                 predicted_log_mar,
                 body,
                 object_dpt=self._state.values[DISTANCE.name],
@@ -168,17 +235,23 @@ class FigurePanel:
             if log_mar is None:
                 return None
             if not math.isnan(log_mar):
-                found[side] = smallest_row(rows, log_mar)
+                found[name] = smallest_row(rows, log_mar)
         return found
 
     async def _show_figure(self) -> None:
-        self._title.content = f"Figures: {SIDES[self._side].lower()}"
-        body, state = self._body(self._side), self._state.eye_state
-        depends_on_state = self._figure in ("wavefront", "acuity")
-        request = self._figure, body, state if depends_on_state else None
-        if body is None or request == self._drawn_request:
+        state = self._state
+        self._title.content = f"Figures: {state.titles}"
+        bodies = [self._body(name) for name in state.names]
+        known = [body for body in bodies if body is not None]
+        depends_on_state = self._figure in ("wavefront", "acuity", "contrast")
+        eye_state = state.eye_state
+        request = self._figure, known, eye_state if depends_on_state else None
+        if len(known) < len(bodies) or request == self._drawn_request:
             return
-        png = await self._answer("figure", eye_figure, self._figure, body, **state)
+        labels = [state.title(name) for name in state.names]
+        png = await self._answer(
+            "figure", eye_figures, self._figure, known, labels, **eye_state
+        )
         if png is not None:
             self._drawn_request = request
             self._image.content = _image(png, FIGURE_TITLES[self._figure])
@@ -190,16 +263,24 @@ def _image(png: bytes, text: str) -> str:
     return f'<img src="data:image/png;base64,{data}" alt="{text}">'
 
 
-def describe_point(facts: dict[str, float]) -> str:
-    """Describe a point's position and the width of its image."""
+def describe_place(facts: dict[str, float]) -> str:
+    """Describe the position of a point of the scene."""
     h_deg, v_deg = facts["h_deg"], facts["v_deg"]
+    distance = f"at {distance_text(facts['object_dpt'])}."
+    if max(abs(h_deg), abs(v_deg)) < LEAST_OFFSET_DEG:
+        return f"In the gaze direction, {distance}"
     across = f"{abs(h_deg):.1f}° {'right' if h_deg >= 0 else 'left'} of"
     along = f"{abs(v_deg):.1f}° {'above' if v_deg >= 0 else 'below'}"
+    return f"{across} and {along} the gaze direction, {distance}"
+
+
+def describe_width(facts: dict[str, float]) -> str:
+    """Describe the width of the image of a point."""
+    half_light_arcmin = facts["half_light_arcmin"]
     return (
-        f"{across} and {along} the gaze direction, at "
-        f"{distance_text(facts['object_dpt'])}. Half of the point's light lies within "
-        f"{facts['half_light_arcmin']:.1f} arcmin of its center: a spot about as wide "
-        f"as {nearest_familiar_object(facts['half_light_arcmin'])}."
+        f"A spot about as wide as {nearest_familiar_object(half_light_arcmin)}. "
+        f"Half of the point's light lies within {half_light_arcmin:.1f} arcmin of its "
+        "center."
     )
 
 

@@ -12,7 +12,7 @@ import json
 import math
 import multiprocessing
 import os
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Sequence
 from functools import lru_cache
 from multiprocessing.connection import Connection
 from typing import Any
@@ -26,11 +26,15 @@ from clients.figures import (
     EyeStudy,
     acuity_log_mar,
     cross_section_figure,
+    draw_acuity_of_several,
+    draw_mtf,
+    draw_mtf_of_several,
     draw_through_focus_acuity,
     draw_wavefront_map,
 )
 from clients.figures.curves import blur_arcmin, draw_field_map
 from clients.figures.style import new_figure
+from clients.web.comparison import joined_png
 from clients.web.picture import png_of
 from estimator import (
     EyeOptics,
@@ -49,7 +53,11 @@ FIGURE_TITLES = {
     "field": "Field",
     "section": "Section",
     "acuity": "Acuity",
+    "contrast": "Contrast",
 }
+OVERLAID = {"acuity": draw_acuity_of_several, "contrast": draw_mtf_of_several}
+"""Figures of two eyes in one diagram; others are beside each other."""
+
 AXIS_PT = 8.0
 
 SIDE_PX = 129
@@ -185,15 +193,49 @@ def _call(
         return None, f"{type(error).__name__}: {error}"
 
 
-@lru_cache(maxsize=4)
+@lru_cache(maxsize=8)
 def _study(body: str) -> EyeStudy:
     return EyeStudy.of(json.loads(body))
+
+
+def eye_figures(
+    name: str,
+    bodies: Sequence[str],
+    labels: Sequence[str],
+    *,
+    pupil_diameter_mm: float,
+    focus_dpt: float,
+) -> bytes:
+    """Return a figure of one or two eyes as a PNG: overlaid curves, or two pictures.
+
+    Parameters
+    ----------
+    name : one of `FIGURE_TITLES`
+    bodies : profile of each eye as JSON
+    labels : name of each eye
+    """
+    if len(bodies) == 2 and name in OVERLAID:
+        figure = new_figure(150.0, 95.0)
+        studies = [_study(body) for body in bodies]
+        OVERLAID[name](
+            figure.subplots(), studies, labels=labels, pupil_mm=pupil_diameter_mm
+        )
+        return _png(figure)
+    state = {"pupil_diameter_mm": pupil_diameter_mm, "focus_dpt": focus_dpt}
+    pictures = [eye_figure(name, body, **state) for body in bodies]
+    return pictures[0] if len(pictures) == 1 else joined_png(pictures, labels)
+
+
+def _png(figure: Figure) -> bytes:
+    file = io.BytesIO()
+    figure.savefig(file, format="png", dpi=DOTS_PER_INCH)
+    return file.getvalue()
 
 
 def eye_figure(
     name: str, body: str, *, pupil_diameter_mm: float, focus_dpt: float
 ) -> bytes:
-    """Return a figure as a PNG.
+    """Return a figure of one eye as a PNG.
 
     Parameters
     ----------
@@ -210,6 +252,9 @@ def eye_figure(
         figure = new_figure(95.0, 90.0)
         axes = figure.subplots()
         draw_through_focus_acuity(axes, study, pupils_mm=[pupil_diameter_mm])
+    elif name == "contrast":
+        figure = new_figure(95.0, 75.0)
+        draw_mtf(figure.subplots(), study)
     else:
         seen = study.wavefront(
             pupil_diameter_mm, object_dpt=focus_dpt, focus_dpt=focus_dpt
@@ -222,9 +267,7 @@ def eye_figure(
             eye_side=study.profile.eye_side,
             title=f"Focused at {focus_dpt:.2f} dpt",
         )
-    file = io.BytesIO()
-    figure.savefig(file, format="png", dpi=DOTS_PER_INCH)
-    return file.getvalue()
+    return _png(figure)
 
 
 def predicted_log_mar(
@@ -257,7 +300,7 @@ def _field_figure(study: EyeStudy) -> Figure:
     return figure
 
 
-@lru_cache(maxsize=4)
+@lru_cache(maxsize=8)
 def _eye(body: str) -> EyeOptics:
     eye, _ = prepare_eye(
         parse_profile(json.loads(body)),

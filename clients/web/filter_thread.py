@@ -19,7 +19,8 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from clients.web.eye_form import EyeSide, depends_on_gaze
+from clients.web.comparison import EyeName
+from clients.web.eye_form import depends_on_gaze
 from clients.web.picture import Picture, coarser, jpeg_of, png_of
 from filter_service import EyeFilter, FilterError, FilterSettings
 from filter_service.messages import State, WithState
@@ -60,7 +61,7 @@ class PictureRequest(WithState):
 
     number: int
     picture: Picture
-    bodies: Mapping[EyeSide, Mapping[str, Any]]
+    bodies: Mapping[EyeName, Mapping[str, Any]]
     state: State
     pipeline: Pipeline = "exact"
 
@@ -78,7 +79,7 @@ class SentPicture:
     """
 
     kind: Kind
-    eye: EyeSide | None
+    eye: EyeName | None
     number: int
     data: bytes
     facts: Mapping[str, Any] = field(default_factory=dict)
@@ -95,11 +96,11 @@ class EyeView:
 
     Attributes
     ----------
-    side : "OD" or "OS"
+    side : name of the eye or state
     seen : number of the last request that each kind of picture was returned for
     """
 
-    def __init__(self, side: EyeSide) -> None:
+    def __init__(self, side: EyeName) -> None:
         self.side = side
         self.seen: dict[Kind, int] = {"preview": 0, "full": 0}
         self._filters: dict[Kind, EyeFilter] = {}
@@ -178,7 +179,7 @@ class EyeView:
             eye_filter.close()
 
 
-def failed(side: EyeSide, request: PictureRequest, reason: str) -> SentPicture:
+def failed(side: EyeName, request: PictureRequest, reason: str) -> SentPicture:
     """Return a message that a picture failed, and why."""
     return SentPicture("failed", side, request.number, b"", {"error": reason})
 
@@ -192,7 +193,7 @@ class _Page:
     arrived_s: float = 0.0
     current: PictureRequest | None = None
     begun_s: float = 0.0
-    eyes: dict[EyeSide, EyeView] = field(default_factory=dict)
+    eyes: dict[EyeName, EyeView] = field(default_factory=dict)
 
     def step(self) -> float | None:
         """Do a piece of work; return the time until the next step, in s, or None."""

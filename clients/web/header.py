@@ -13,6 +13,7 @@ from clients.headset.runtime import Eye
 from clients.openxr_layer.wire import ask as ask_helper
 from clients.openxr_layer.wire import socket_path
 from clients.report import report_html
+from clients.web.comparison import EyeName, joined_png, label_of, side_of
 from clients.web.eye_form import SIDES, EyeSide
 from clients.web.figure_worker import Ask, FigureFailed
 from clients.web.page_state import PageState, fragment_of
@@ -121,43 +122,72 @@ class Header:
         if state.empty_reason:
             warn(state.empty_reason)
             return
-        sides = state.sides
+        names = state.names
         try:
             async with asyncio.timeout(READY_S):
-                for side in sides:  # wait for an eye that is still being prepared
-                    while not self._sender.is_final(side, state.number):
+                for name in names:  # wait for an eye that is still being prepared
+                    while not self._sender.is_final(name, state.number):
                         await asyncio.sleep(POLL_S)
         except TimeoutError:
             warn("The full picture is not ready yet")
             return
-        for side in sides:
-            seen = self._sender.last[side]
-            if seen.kind == "full":
-                ui.download(seen.data, f"ocufilter_{side}.png")
+        seen = {name: self._sender.last[name] for name in names}
+        if any(picture.kind != "full" for picture in seen.values()):
+            warn("There is no picture of these entries")
+            return
+        if state.is_comparing:
+            labels = [label_of(name, state.valid_profiles[name]) for name in names]
+            pictures = [picture.data for picture in seen.values()]
+            joined = await asyncio.to_thread(joined_png, pictures, labels)
+            ui.download(joined, f"ocufilter_{state.sides[0]}_A_B.png")
+            return
+        for name, picture in seen.items():
+            ui.download(picture.data, f"ocufilter_{name}.png")
 
     async def _report(self) -> None:
-        for side in self._state.sides:
-            body = self._state.profile_at_gaze(side)
-            if body is None:
-                continue
-            label = SIDES[side]
-            waiting = ui.notification(
-                f"Writing the report on the {label.lower()}…",
-                spinner=True,
-                timeout=None,
-                position="top",
+        state = self._state
+        bodies = {name: state.profile_at_gaze(name) for name in state.names}
+        known = {name: body for name, body in bodies.items() if body is not None}
+        if state.is_comparing and len(known) == len(state.names):
+            before, after = known.values()
+            await self._write_report(
+                f"{SIDES[state.sides[0]].lower()}, A and B",
+                f"{state.sides[0]}_A_B",
+                *(before, after),
+                label="A",
+                after_label="B",
             )
-            try:
-                text = await self._ask(f"report {side}", report_html, body, label=label)
-            finally:
-                waiting.dismiss()
-            if text is not None:
-                ui.download(text.encode(), f"ocufilter_{side}.html")
+            return
+        for name, body in known.items():
+            label = SIDES[side_of(name)]
+            await self._write_report(label.lower(), name, body, label=label)
+
+    async def _write_report(
+        self, subject: str, file_name: str, *bodies: dict[str, Any], **labels: str
+    ) -> None:
+        """Write a report on one profile or on two, and download it."""
+        waiting = ui.notification(
+            f"Writing the report on the {subject}…",
+            spinner=True,
+            timeout=None,
+            position="top",
+        )
+        try:
+            kind = f"report {file_name}"
+            text = await self._ask(kind, report_html, *bodies, **labels)
+        finally:
+            waiting.dismiss()
+        if text is not None:
+            ui.download(text.encode(), f"ocufilter_{file_name}.html")
 
     async def _profile(self) -> None:
-        for side in self._state.sides:
-            text = json.dumps(self._state.body(side), indent=1)
-            ui.download(text.encode(), f"ocufilter_{side}.json")
+        for name in self._state.names:
+            text = json.dumps(self._state.body(name), indent=1)
+            file_name = f"{self._file_name(name)}.json"
+            ui.download(text.encode(), f"ocufilter_{file_name}")
+
+    def _file_name(self, name: EyeName) -> str:
+        return f"{name}_A" if self._state.is_comparing and name in SIDES else name
 
     async def _headset(self) -> None:
         eyes: dict[str, str] = {

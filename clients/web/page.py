@@ -13,17 +13,21 @@ from fastapi import Response
 from fastapi.responses import HTMLResponse
 from nicegui import Client, app, background_tasks, events, run, ui
 
+from clients.web.comparison import EYE_NAMES, EyeName, side_of
 from clients.web.controls import (
     AGE,
-    CONDITIONS,
     DISTANCE,
+    DISTANCES_M,
     FOCUS,
+    GAZE_H,
+    GAZE_V,
+    LIGHTS,
     PUPIL,
     NumberField,
     distance_text,
 )
-from clients.web.eye_form import SIDES, EyeSide
-from clients.web.eye_panel import EyePanel
+from clients.web.eye_form import SIDES
+from clients.web.eyes_card import EyesCard
 from clients.web.figure_panel import FigurePanel
 from clients.web.figure_worker import FigureWorker
 from clients.web.filter_thread import FilterThread, SentPicture
@@ -36,13 +40,15 @@ from clients.web.widgets import (
     Delayed,
     SliderRow,
     card,
+    help_button,
     problem_label,
-    title,
+    select,
+    small_button,
     toggle,
 )
 
 STYLE = (Path(__file__).parent / "style.css").read_text(encoding="utf-8")
-SHOWN = {"OD": "Right eye", "OS": "Left eye", "both": "Both"}
+ARRANGEMENTS = {"divider": "One divider", "beside": "Side by side"}
 PIPELINES = {"exact": "Exact", "published": "Method of 2023 (slow)"}
 """Names of `filter_service.settings.Pipeline`."""
 
@@ -64,6 +70,24 @@ as many as may be open wait for each other."""
 AMPLITUDE = (
     "The amplitude is objective accommodation; a push-up measurement also includes "
     "the depth of focus and is higher."
+)
+
+PICTURE_HELP = (
+    "Left of the divider is the scene, right of it what the eye sees; in a comparison, "
+    "A and B. Drag the divider, or hold a button to see one of them alone. A click "
+    "focuses the eye on what is there. The picture is sharpest in the direction of the "
+    "gaze, the center: objects at the side are blurred, as in every eye."
+)
+CONDITIONS_HELP = (
+    "They hold for all pictures. “Light” sets the pupil by the luminance of the "
+    "surroundings and the age (Watson and Yellott 2012). The focus is the "
+    "distance that the eye looks at; “Distance” is that of the letter chart or of a "
+    "photograph without depth. The pencil beside a slider takes a typed value, such as "
+    "6 m, 40 cm, 20 ft or 2.5 dpt."
+)
+NOT_MEDICAL = (
+    "Not a medical device: for demonstration and research. It models the optics of an "
+    "eye, not its health, and does not replace an examination."
 )
 
 PICTURES_PATH = "/pictures/"
@@ -111,7 +135,8 @@ class Page:
         self.sender = resources.picture_senders[self.name] = PictureSender()
         self._figure_refresh = Delayed(FIGURES_DELAY_S)
         self._announcement = Delayed(STATUS_DELAY_S)
-        self._notes: dict[EyeSide, str] = {}
+        self._notes: dict[EyeName, str] = {}
+        self._rows_read: dict[EyeName, int | None] = {}
         self.rows: dict[str, SliderRow] = {}
         loop = asyncio.get_running_loop()
         resources.filter_thread.open(
@@ -123,83 +148,93 @@ class Page:
     # Layout
 
     def _build(self, token: str) -> None:
+        state = self.state
         ui.add_css(STYLE)
         ui.colors(primary="#1f5fa8", negative="#b3262e", positive="#2c8a57")
         ui.context.client.content.classes("oc-content")
         ask = partial(self.resources.figure_worker.ask, self.name)
         self.header = Header(
-            *(self.state, self.sender, ask, token),
+            *(state, self.sender, ask, token),
             scene=lambda: self.scene.kind,
             on_fragment=self._restore,
         )
-        self.figures = FigurePanel(self.state, ask)
+        self.figures = FigurePanel(state, ask)
         with ui.element("div").classes("oc-page"):  # NiceGUI adds the <main>
             with ui.element("div").classes("oc-columns"):
                 with ui.element("div").classes("oc-left"):
-                    self._eyes_card()
+                    self.eyes = EyesCard(
+                        *(state, self._slider),
+                        on_shown=self._show_eyes,
+                        on_change=self._change_eye,
+                        on_file=self._take_file,
+                    )
                     self.figures.build_point()
                 with ui.element("div").classes("oc-middle"):
                     self._picture_card()
                     self._sliders_card()
-            self.figures.build_figure()
+                    with ui.element("div").classes("oc-results"):
+                        self.figures.build_figure()
+            ui.label(NOT_MEDICAL).classes("oc-hint oc-disclaimer")
 
     def _picture_card(self) -> None:
         state = self.state
         with card("Picture", "oc-picture"):
-            self.scene = ScenePanel(state, self._set_picture, self._set_empty)
-            self.view = PictureView(
-                PICTURES_PATH + self.name, state.sides, DEFAULT_ASPECT
-            )
+            with ui.element("div").classes("oc-scene-line"):
+                self.scene = ScenePanel(
+                    state, self._set_picture, self._set_empty, self._mark_rows
+                )
+            self.view = PictureView(PICTURES_PATH + self.name, DEFAULT_ASPECT)
             self.view.on("point", self._point)
             self.view.on("look", self._focus)
-            self._status = ui.label("").classes("oc-status")
-            self._status.props("role=status aria-live=polite")
-            self._note = ui.label("").classes("oc-note").props("aria-live=polite")
+            with self.view:
+                self._arrangement = toggle(
+                    *(ARRANGEMENTS, state.arrangement, self._arrange),
+                    label="Arrangement of A and B",
+                    props="size=sm",
+                    kind="oc-arrangement",
+                )
+                with ui.element("div").classes("oc-told"):
+                    self._status = ui.label("").classes("oc-status")
+                    self._status.props("role=status aria-live=polite")
+                    self._note = ui.label("").classes("oc-note")
+                    self._note.props("aria-live=polite")
+                help_button("the picture", PICTURE_HELP)
             self._scene_problem = problem_label()
+            self._show_views()
 
     def _sliders_card(self) -> None:
         with card("Viewing conditions", "oc-sliders"):
-            for number in CONDITIONS:
-                if number is not AGE:
-                    self._slider(number)
-            with (
-                ui.element("div").classes("oc-look").props("role=group aria-label=Look")
-            ):
-                ui.label("Look").props("aria-hidden=true")
-                for label, is_reading in (("Far", False), ("Reading", True)):
-                    ui.button(label, on_click=partial(self._look, is_reading)).props(
-                        "outline dense no-caps size=sm"
-                    ).classes("oc-download")
+            for number in (PUPIL, FOCUS, DISTANCE, GAZE_H, GAZE_V):
+                self._slider(number)
+            self._light = select(
+                {name: text for name, (text, _) in LIGHTS.items()},
+                self.state.light,
+                self._set_light,
+                label="Light",
+            ).classes("oc-light")
+            with ui.element("div").classes("oc-look"):
+                with ui.element("div").classes("oc-look-group") as group:
+                    group.props("role=group aria-label=Look")
+                    ui.label("Look").props("aria-hidden=true")
+                    for label, is_reading in (("Far", False), ("Reading", True)):
+                        small_button(label, partial(self._look, is_reading))
+                with ui.element("div").classes("oc-look-group") as group:
+                    group.props('role=group aria-label="Distance of chart or photo"')
+                    ui.label("Distance").props("aria-hidden=true")
+                    for label, meters in DISTANCES_M.items():
+                        small_button(label, partial(self._set_distance, meters))
                 ui.element("span").classes("oc-grow")
                 self._pipelines = toggle(
                     *(PIPELINES, self.state.pipeline, self._choose_pipeline),
                     label="Method",
                     props="size=sm",
                 )
+                help_button("viewing conditions", CONDITIONS_HELP)
 
-    def _slider(self, number: NumberField) -> None:
+    def _slider(self, number: NumberField) -> SliderRow:
         value = self.state.values[number.name]
         self.rows[number.name] = SliderRow(number, value, self._slide)
-
-    def _eyes_card(self) -> None:
-        with card("Eye"):
-            with ui.element("div").classes("oc-line"):
-                title("The eye")
-                self._copy = ui.button("Copy to the other eye", on_click=self._copy_eye)
-                self._copy.props("flat dense no-caps size=sm")
-            self._shown = toggle(
-                *(SHOWN, self.state.shown, self._show),
-                label="Eyes shown",
-                props="spread",
-                kind="oc-shown",
-            )
-            self._slider(AGE)
-            self.panels = {
-                side: EyePanel(form, self._change_eye, self._take_file)
-                for side, form in self.state.eyes.items()
-            }
-            self._show_boxes()
-            self._problem = problem_label()
+        return self.rows[number.name]
 
     # Entries
 
@@ -214,11 +249,11 @@ class Page:
     def _restore(self, fragment: str) -> None:
         """Restore the entries from a fragment of the address."""
         found = restore(self.state, fragment)
-        for panel in self.panels.values():
-            panel.build.refresh()
-        self._show_values()
+        self._show_entries()
         self._pipelines.value = self.state.pipeline
-        self._shown.value = self.state.shown  # shows the eyes, too
+        self._arrangement.value = self.state.arrangement
+        self.scene.show_notation()
+        self._show_views()
         self._scene_problem.text = " ".join(found.problems)
         # links never contain a photo: keep it unless the link selects another scene
         keeps_file = found.scene == SCENES[0] and self.scene.kind not in SCENES
@@ -230,6 +265,12 @@ class Page:
     def _show_values(self) -> None:
         for name, row in self.rows.items():
             row.show(self.state.values[name])
+        self._light.value = self.state.light
+
+    def _show_entries(self) -> None:
+        """Show all entries after changes that were not made in the panels."""
+        self.eyes.refresh()
+        self._show_values()
 
     def _change_eye(self) -> None:
         """Request a picture if a profile has changed; report invalid entries."""
@@ -243,15 +284,16 @@ class Page:
         problems = self.state.problems()
         if problems and self.state.valid_profiles:
             problems.append("The pictures show the last valid entries.")
-        self._problem.text = "\n".join(problems)
+        self.eyes.problem.text = "\n".join(problems)
 
     def request(self) -> None:
         """Request a picture for the current entries; report invalid entries."""
         request = self.state.request()
         self._report_problems()
+        self.eyes.show_differences()
         if request is None:
             return
-        self.view.show(alts={side: self._alt(side) for side in self.state.sides})
+        self.view.show(alts={name: self._alt(name) for name in self.state.names})
         self._announcement.call(
             self._status.set_text,
             f"Preparing the {self.state.titles}: estimating the eye model and "
@@ -263,12 +305,15 @@ class Page:
             lambda: background_tasks.create(self._refresh_figures())
         )
 
-    def _alt(self, side: EyeSide) -> str:
+    def _alt(self, name: EyeName) -> str:
         """Return the text alternative of an eye's picture."""
         values, picture = self.state.values, self.state.picture
         scene = picture.title if picture is not None else "scene"
+        eye = SIDES[side_of(name)].lower()
+        if self.state.is_comparing:
+            eye += f" in state {self.state.title(name)}"
         return (
-            f"{scene} as the {SIDES[side].lower()} sees it through a pupil of "
+            f"{scene} as the {eye} sees it through a pupil of "
             f"{values[PUPIL.name]:.1f} mm, focused at "
             f"{distance_text(values[FOCUS.name])}"
         )
@@ -280,13 +325,34 @@ class Page:
             read = await self.figures.smallest_rows()
             shown = self.state.picture
             if read is not None and shown and shown.chart_rows == picture.chart_rows:
-                self.view.mark_rows(shown, read)
+                self._rows_read = read
+                self._mark_rows()
         await self.figures.refresh()
+
+    def _mark_rows(self) -> None:
+        """Label the rows of a chart in the chosen notation."""
+        if self.state.picture is not None:
+            notation = self.state.notation
+            self.view.mark_rows(self.state.picture, self._rows_read, notation)
+        self.header.schedule_update()
 
     def _slide(self, name: str, value: float) -> None:
         self.state.move(name, value)
-        if name == DISTANCE.name:
-            self.rows[FOCUS.name].show(self.state.values[FOCUS.name])
+        moved = {DISTANCE.name: FOCUS, AGE.name: PUPIL}.get(name)
+        if moved is not None:
+            self.rows[moved.name].show(self.state.values[moved.name])
+        self._light.value = self.state.light
+        self.request()
+
+    def _set_light(self, event: events.ValueChangeEventArguments) -> None:
+        if event.value != self.state.light:
+            self.state.set_light(event.value)
+            self._show_values()
+            self.request()
+
+    def _set_distance(self, meters: float) -> None:
+        self.state.move(DISTANCE.name, 1.0 / meters)
+        self._show_values()
         self.request()
 
     def _look(self, is_reading: bool) -> None:
@@ -298,49 +364,45 @@ class Page:
         self.state.pipeline = event.value
         self.request()
 
-    async def _take_file(self, side: EyeSide, name: str, content: bytes) -> None:
-        loaded_side = self.state.load_file(side, name, content)
-        self._show_values()
-        for panel in self.panels.values():
-            panel.build.refresh()
-        if loaded_side != side:
+    async def _take_file(self, eye: EyeName, name: str, content: bytes) -> None:
+        loaded = self.state.load_file(eye, name, content)
+        self._show_entries()
+        if loaded != eye:
             ui.notify(
-                f"{name} is a profile of the {SIDES[loaded_side].lower()} and "
+                f"{name} is a profile of the {SIDES[side_of(loaded)].lower()} and "
                 "was loaded there",
                 position="top",
                 timeout=6000,
             )
-        if loaded_side in (side, *self.state.sides):
+        if loaded in (eye, *self.state.names):
             self.request()
         else:
-            self._shown.value = loaded_side  # requests it
+            self.eyes.show_eye(loaded)  # requests it
 
-    def _show(self, event: events.ValueChangeEventArguments) -> None:
-        self.state.shown = event.value
-        self._show_boxes()
-        self.view.show(eyes=list(self.state.sides))
-        self._show_notes()
-        self._copy.set_visibility(self.state.shown != "both")
+    def _show_eyes(self) -> None:
+        """Show other eyes or states."""
+        self._show_values()
+        self._show_views()
         self.request()
 
-    def _show_boxes(self) -> None:
-        for side, panel in self.panels.items():
-            panel.box.set_visibility(side in self.state.sides)
-            panel.heading.set_visibility(self.state.shown == "both")
-
-    def _copy_eye(self) -> None:
-        side = self.state.sides[0]
-        other = next(s for s in SIDES if s != side)
-        self.state.eyes[other].copy(self.state.eyes[side])
-        self.panels[other].changed()
-        ui.notify(
-            f"{SIDES[other]}: as the {SIDES[side].lower()}",
-            position="top",
-            timeout=2000,
+    def _show_views(self) -> None:
+        """Show the pictures of the selected eyes or states, and their entries."""
+        state = self.state
+        self.view.show(
+            eyes=list(state.names),
+            labels_of={name: state.title(name) for name in state.names},
+            behind_one=state.is_comparing and state.arrangement == "divider",
         )
+        self._arrangement.set_visibility(state.is_comparing)
+        self._show_notes()
+
+    def _arrange(self, event: events.ValueChangeEventArguments) -> None:
+        self.state.arrangement = event.value
+        self._show_views()
+        self.header.schedule_update()
 
     async def _point(self, event: events.GenericEventArguments) -> None:
-        if event.args["eye"] in SIDES:
+        if event.args["eye"] in EYE_NAMES:
             await self.figures.point(event.args["eye"], *_position(event))
 
     def _focus(self, event: events.GenericEventArguments) -> None:
@@ -373,7 +435,8 @@ class Page:
         self._set_empty("")
         aspect = picture.view.width_px / picture.view.height_px
         self.view.show(scene=picture.title, aspect=aspect)
-        self.view.mark_rows(picture, {})
+        self._rows_read = {}
+        self._mark_rows()
         number, data = self.state.number + 1, png_of(picture.view.color)
         self.sender.put(SentPicture("scene", None, number, data))
         self.request()
@@ -389,20 +452,25 @@ class Page:
             sentences.append(AMPLITUDE)
         self._notes[seen.eye] = " ".join(sentences)
         self._show_notes()
-        number, sides = self.state.number, self.state.sides
+        number, names = self.state.number, self.state.names
         if seen.number == number and all(
-            self.sender.is_final(side, number) for side in sides
+            self.sender.is_final(name, number) for name in names
         ):
             self._announcement.cancel()
             result = "full picture." if seen.kind == "full" else "no picture."
-            self._status.text = f"{self.state.titles.capitalize()}: {result}"
+            titles = self.state.titles
+            self._status.text = f"{titles[:1].upper()}{titles[1:]}: {result}"
 
     def _show_notes(self) -> None:
-        notes = {side: self._notes.get(side, "") for side in self.state.sides}
+        notes = {name: self._notes.get(name, "") for name in self.state.names}
         if len(notes) == 1:
             (self._note.text,) = notes.values()
         else:
-            lines = [f"{SIDES[side]}: {text}" for side, text in notes.items() if text]
+            lines = [
+                f"{self.state.title(name)}: {text}"
+                for name, text in notes.items()
+                if text
+            ]
             self._note.text = "\n".join(lines)
 
     def close(self) -> None:

@@ -7,21 +7,37 @@ the entries that differ from a new page, and never the content of a file.
 from __future__ import annotations
 
 import base64
+import copy
 import json
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args
 
+from clients.acuity_text import Notation
+from clients.web.comparison import (
+    B_OF,
+    EYE_NAMES,
+    Difference,
+    EyeName,
+    differences,
+    side_of,
+    title_of,
+)
 from clients.web.controls import (
     AGE,
+    AGE_B,
+    BY_HAND,
     CONDITIONS,
     DISTANCE,
     FOCUS,
     GAZE_H,
     GAZE_V,
+    LIGHTS,
     PUPIL,
+    NumberField,
     initial_values,
+    pupil_by_light_mm,
 )
 from clients.web.eye_form import (
     DESIGNS,
@@ -48,6 +64,8 @@ from filter_service.messages import State
 from filter_service.settings import Pipeline
 
 Shown = Literal["OD", "OS", "both"]
+Arrangement = Literal["divider", "beside"]
+"""A and B behind one divider, or beside each other, each with the scene."""
 
 READING_DPT = 2.5
 READING_GAZE_DEG = -30.0
@@ -68,7 +86,13 @@ class PageState:
 
     Attributes
     ----------
-    values : viewing conditions by field name
+    eyes : entries of both eyes; of state A where two states are compared
+    others : entries of state B of each eye
+    values : viewing conditions by field name; those of A and B are the same but for age
+    wants_comparison : whether A and B are shown while one eye is selected
+    arrangement : of the pictures of A and B
+    notation : of acuity beside logMAR
+    light : level of light that sets the pupil, a key of `LIGHTS`
     is_focus_set : whether the user set the focus, so that it ignores the distance
     picture : the scene; None until one is ready
     empty_reason : text in place of the picture, or an empty string
@@ -81,14 +105,22 @@ class PageState:
     eyes: dict[EyeSide, EyeForm] = field(
         default_factory=lambda: {side: EyeForm(side) for side in SIDES}
     )
+    others: dict[EyeSide, EyeForm] = field(
+        default_factory=lambda: {side: EyeForm(side) for side in SIDES}
+    )
     values: dict[str, float] = field(default_factory=initial_values)
+    wants_comparison: bool = False
+    arrangement: Arrangement = "divider"
     is_focus_set: bool = False
+    light: str = BY_HAND
+    notation: Notation = "decimal"
     picture: Picture | None = None
     empty_reason: str = ""
     shown: Shown = "OD"
     pipeline: Pipeline = "exact"
     number: int = 0
-    valid_profiles: dict[EyeSide, Mapping[str, Any]] = field(default_factory=dict)
+    _scene_focus_dpt: float | None = None
+    valid_profiles: dict[EyeName, Mapping[str, Any]] = field(default_factory=dict)
 
     @property
     def sides(self) -> tuple[EyeSide, ...]:
@@ -96,31 +128,91 @@ class PageState:
         return tuple(SIDES) if self.shown == "both" else (self.shown,)
 
     @property
+    def is_comparing(self) -> bool:
+        """Return whether states A and B of one eye are shown."""
+        return self.wants_comparison and self.shown != "both"
+
+    @property
+    def names(self) -> tuple[EyeName, ...]:
+        """Return the names of the pictures that are shown."""
+        if self.is_comparing:
+            return (self.sides[0], B_OF[self.sides[0]])
+        return self.sides
+
+    def title(self, name: EyeName) -> str:
+        """Return the name of a picture as displayed."""
+        return title_of(name, is_comparing=self.is_comparing)
+
+    @property
     def titles(self) -> str:
-        """Return the names of the eyes that are shown, in lower case."""
+        """Return the names of the pictures that are shown, in lower case but A, B."""
+        if self.is_comparing:
+            return f"{SIDES[self.sides[0]].lower()}, A and B"
         return " and ".join(SIDES[side].lower() for side in self.sides)
 
-    def body(self, side: EyeSide) -> dict[str, Any]:
-        """Return an eye's profile.
+    def form(self, name: EyeName) -> EyeForm:
+        """Return the entries of an eye or of its state B."""
+        side = side_of(name)
+        return self.eyes[side] if name == side else self.others[side]
+
+    def age(self, name: EyeName) -> NumberField:
+        """Return the field of the age of an eye or of its state B."""
+        return AGE if name == side_of(name) else AGE_B
+
+    def body(self, name: EyeName) -> dict[str, Any]:
+        """Return the profile of an eye or of its state B.
 
         Raises
         ------
         ValueError
             An invalid entry: its value and the allowed ones.
         """
-        return self.eyes[side].body(age_years=self.values[AGE.name])
+        return self.form(name).body(age_years=self.values[self.age(name).name])
 
     def problems(self) -> list[str]:
         """Return the errors in the entries of the eyes shown."""
         found = []
-        for side in self.sides:
+        for name in self.names:
             try:
-                self.body(side)
+                self.body(name)
             except NoFile:
                 continue  # not an error: the upload shows what is allowed
             except ValueError as error:
-                found.append(f"{SIDES[side]}: {error}")
+                found.append(f"{self.title(name)}: {error}")
         return found
+
+    # Comparison
+
+    def compare(self, is_on: bool) -> None:
+        """Show states A and B of one eye, or one state; B starts as a copy of A."""
+        if is_on and self.shown == "both":
+            self.shown = "OD"
+        if is_on and self.others[self.sides[0]] == EyeForm(self.sides[0]):
+            self.copy_to_b()
+        self.wants_comparison = is_on
+
+    def copy_to_b(self) -> None:
+        """Set the entries of state B of the eye shown to those of A."""
+        side = self.sides[0]
+        self.others[side].copy(self.eyes[side])
+        self.values[AGE_B.name] = self.values[AGE.name]
+
+    def swap(self) -> None:
+        """Exchange A and B of the eye shown."""
+        side = self.sides[0]
+        old = copy.deepcopy(self.eyes[side])
+        self.eyes[side].copy(self.others[side])
+        self.others[side].copy(old)
+        values = self.values
+        values[AGE.name], values[AGE_B.name] = values[AGE_B.name], values[AGE.name]
+
+    def differences(self) -> list[Difference]:
+        """Return the entries in which the last valid states A and B differ."""
+        bodies = [self.valid_profiles.get(name) for name in self.names]
+        if not self.is_comparing or None in bodies:
+            return []
+        a, b = (body for body in bodies if body is not None)
+        return differences(a, b)
 
     @property
     def eye_state(self) -> dict[str, float]:
@@ -138,13 +230,23 @@ class PageState:
         follows = self.picture is not None and self.picture.follows_gaze
         return (0.0, 0.0) if follows else self.gaze_deg
 
-    def profile_at_gaze(self, side: EyeSide) -> dict[str, Any] | None:
+    def profile_at_gaze(self, name: EyeName) -> dict[str, Any] | None:
         """Return an eye's last valid profile, with its correction at the gaze."""
-        body = self.valid_profiles.get(side)
+        body = self.valid_profiles.get(name)
         return None if body is None else profile_for_gaze(body, self.gaze_deg)
 
     def set_picture(self, picture: Picture) -> None:
-        """Set the picture; the first one also sets its initial focus and pupil."""
+        """Set the picture; the first one also sets its initial focus and pupil.
+
+        The focus on a flat picture ends with it: a scene gets its own focus back.
+        """
+        was_flat = self.picture is not None and self.picture.distance_dpt is not None
+        is_flat = picture.distance_dpt is not None
+        if is_flat and self.picture is not None and not was_flat:
+            self._scene_focus_dpt = self.values[FOCUS.name]
+        elif was_flat and not is_flat and self._scene_focus_dpt is not None:
+            self.values[FOCUS.name] = self._scene_focus_dpt
+            self._scene_focus_dpt, self.is_focus_set = None, False
         if self.picture is None:
             for number in (FOCUS, PUPIL):
                 value = getattr(picture, number.name)
@@ -167,14 +269,25 @@ class PageState:
         The focus follows the distance of a flat picture until the user sets it.
         """
         self.values[name] = value
+        if name == PUPIL.name:
+            self.light = BY_HAND
+        elif name == AGE.name:
+            self.set_light(self.light)
         if name == FOCUS.name:
             self.is_focus_set = True
         elif name == DISTANCE.name:
             self._focus_on_picture()
 
+    def set_light(self, light: str) -> None:
+        """Set the pupil by a level of light; it follows the age of A."""
+        self.light = light
+        if light != BY_HAND:
+            pupil_mm = pupil_by_light_mm(light, self.values[AGE.name])
+            self.values[PUPIL.name] = pupil_mm
+
     def look(self, *, is_reading: bool) -> None:
         """Look straight ahead and far, or down at a reading distance."""
-        bodies = (self.valid_profiles.get(side, {}) for side in self.sides)
+        bodies = (self.valid_profiles.get(name, {}) for name in self.names)
         turns_deg = [turn for body in bodies if (turn := reading_gaze_deg(body))]
         gaze_deg = max(min([*turns_deg, 0.0]) or READING_GAZE_DEG, GAZE_V.low)
         distance_dpt = READING_DPT if is_reading else 0.0
@@ -186,13 +299,16 @@ class PageState:
         }
         self.is_focus_set = False
 
-    def load_body(self, side: EyeSide, body: Mapping[str, Any], name: str) -> None:
+    def load_body(self, eye: EyeName, body: Mapping[str, Any], name: str) -> None:
         """Load a profile into an eye, with the age of the person."""
-        self.eyes[side].load_body(body, name)
-        self.values[AGE.name] = body.get(AGE.name, self.values[AGE.name])
+        self.form(eye).load_body(body, name)
+        age = self.age(eye).name
+        self.values[age] = body.get(AGE.name, self.values[age])
 
-    def load_file(self, side: EyeSide, name: str, content: bytes) -> EyeSide:
-        """Load a profile file into the eye that it names, by default into `side`.
+    def load_file(self, eye: EyeName, name: str, content: bytes) -> EyeName:
+        """Load a profile file into the eye that it names, by default into `eye`.
+
+        A file that is loaded into state A or B of a comparison stays there.
 
         Returns
         -------
@@ -204,18 +320,21 @@ class PageState:
             Not a profile; nothing has changed.
         """
         body = read_profile_file(name, content)
-        loaded_side: EyeSide = body.get("eye_side", side)
-        self.load_body(loaded_side, body, Path(name).name)
-        if loaded_side != side and self.eyes[side].file_body is None:
-            self.eyes[side].source = "prescription"
-        return loaded_side
+        loaded = eye if self.is_comparing else body.get("eye_side", eye)
+        self.load_body(loaded, body, Path(name).name)
+        if loaded != eye and self.form(eye).file_body is None:
+            self.form(eye).source = "prescription"
+        return loaded
 
     def reset(self) -> None:
         """Set the initial entries; picture and uploaded files stay available."""
-        for form in self.eyes.values():
-            form.reset()
+        for name in EYE_NAMES:
+            self.form(name).reset()
         self.values.update(initial_values())
         self.shown, self.is_focus_set, self.pipeline = "OD", False, "exact"
+        self.wants_comparison, self.arrangement = False, "divider"
+        self._scene_focus_dpt, self.light = None, BY_HAND
+        self.notation = "decimal"
 
     def read_profiles(self) -> bool:
         """Read the profiles of the eyes shown; return whether any has changed.
@@ -223,9 +342,9 @@ class PageState:
         An eye with an invalid entry keeps its last profile: see `problems`.
         """
         before = dict(self.valid_profiles)
-        for side in self.sides:
+        for name in self.names:
             try:
-                self.valid_profiles[side] = self.body(side)
+                self.valid_profiles[name] = self.body(name)
             except ValueError:
                 continue
         return self.valid_profiles != before
@@ -233,13 +352,13 @@ class PageState:
     def request(self) -> PictureRequest | None:
         """Return the request for the current state; None without a picture or eye."""
         self.read_profiles()
-        shown = [side for side in self.sides if side in self.valid_profiles]
+        shown = [name for name in self.names if name in self.valid_profiles]
         if self.picture is None or not shown:
             return None
         self.picture = self.picture.at(self.values[DISTANCE.name])
-        bodies = {side: self.valid_profiles[side] for side in shown}
+        bodies = {name: self.valid_profiles[name] for name in shown}
         if self.picture.follows_gaze:
-            bodies = {s: profile_for_gaze(bodies[s], self.gaze_deg) for s in shown}
+            bodies = {n: profile_for_gaze(bodies[n], self.gaze_deg) for n in shown}
         self.number += 1
         return PictureRequest(
             number=self.number,
@@ -259,7 +378,8 @@ class PageState:
 
 def fragment_of(state: PageState, scene: str) -> str:
     """Return the entries as the fragment of an address, without ``#``."""
-    changes = _changes(_entries(state, scene), _entries(PageState(), SCENES[0]))
+    initial = _entries(PageState(wants_comparison=True), SCENES[0])
+    changes = _changes(_entries(state, scene), initial | {"compared": False})
     text = json.dumps({"v": VERSION, **changes}, separators=(",", ":"))
     return base64.urlsafe_b64encode(text.encode()).decode().rstrip("=")
 
@@ -270,8 +390,16 @@ def _entries(state: PageState, scene: str) -> dict[str, Any]:
         "pipeline": state.pipeline,
         "scene": scene if scene in SCENES else SCENES[0],
         "focus_set": state.is_focus_set,
+        "compared": state.wants_comparison,
+        "arrangement": state.arrangement,
+        "light": state.light,
+        "notation": state.notation,
         "values": {name: round(value, 4) for name, value in state.values.items()},
-        "eyes": {side: _eye_entries(form) for side, form in state.eyes.items()},
+        "eyes": {
+            name: _eye_entries(state.form(name))
+            for name in EYE_NAMES
+            if state.wants_comparison or name in SIDES
+        },
     }
 
 
@@ -330,8 +458,14 @@ def restore(state: PageState, fragment: str) -> Restored:
         return Restored(None, [text])
     state.reset()
     state.is_focus_set = entries.get("focus_set") is True
+    state.wants_comparison = entries.get("compared") is True
+    state.arrangement = (
+        _choice(entries, "arrangement", get_args(Arrangement)) or state.arrangement
+    )
     state.shown = _choice(entries, "shown", get_args(Shown)) or state.shown
     state.pipeline = _choice(entries, "pipeline", get_args(Pipeline)) or state.pipeline
+    state.light = _choice(entries, "light", LIGHTS) or state.light
+    state.notation = _choice(entries, "notation", get_args(Notation)) or state.notation
     problems = []
     values = state.values | _mapping(entries, "values")
     for number in CONDITIONS:
@@ -345,8 +479,9 @@ def restore(state: PageState, fragment: str) -> Restored:
         else:
             state.values[number.name] = float(value)
     eyes = _mapping(entries, "eyes")
-    for side, title in SIDES.items():
-        found = _restore_eye(state.eyes[side], _mapping(eyes, side))
+    for name in EYE_NAMES if state.wants_comparison else SIDES:
+        title = title_of(name, is_comparing=state.is_comparing)
+        found = _restore_eye(state.form(name), _mapping(eyes, name))
         problems += [f"{title}: {problem}." for problem in found]
     return Restored(_choice(entries, "scene", SCENES) or SCENES[0], problems)
 

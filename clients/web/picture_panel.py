@@ -14,9 +14,10 @@ from fastapi.websockets import WebSocketState
 from nicegui import events, run, ui
 from nicegui.element import Element
 
-from clients.scenes.letter_chart import letter_height, row_texts
+from clients.acuity_text import NOTATION_TITLES, Notation, acuity_text
+from clients.scenes.letter_chart import letter_height
+from clients.web.comparison import EyeName
 from clients.web.controls import DISTANCE
-from clients.web.eye_form import EyeSide
 from clients.web.filter_thread import SentPicture
 from clients.web.page_state import SCENES, PageState
 from clients.web.picture import (
@@ -56,6 +57,20 @@ HALF_WIDTH_HEIGHTS = 4.5
 """Half of a chart row's width in letter heights: five letters and their gaps."""
 
 
+COLUMN_HEADS: Mapping[Notation, str] = {
+    "log_mar": "logMAR",
+    "decimal": "dec.",
+    "feet": "feet",
+    "meters": "meters",
+}
+CAPTION_NAMES: Mapping[Notation, str] = {
+    "log_mar": "logMAR ",
+    "decimal": "decimal ",
+    "feet": "",
+    "meters": "",
+}
+
+
 class ScenePanel:
     """Select the scene; pictures are computed outside the event loop.
 
@@ -63,6 +78,7 @@ class ScenePanel:
     ----------
     on_picture : called with each new picture
     on_empty : called with a text if the selected scene has no file yet
+    on_notation : called when another notation of acuity was chosen
 
     Attributes
     ----------
@@ -74,8 +90,10 @@ class ScenePanel:
         state: PageState,
         on_picture: Callable[[Picture], None],
         on_empty: Callable[[str], None],
+        on_notation: Callable[[], None],
     ) -> None:
         self._state, self._on_picture, self._on_empty = state, on_picture, on_empty
+        self._on_notation = on_notation
         self.kind = SCENES[0]
         self._gltf: Picture | None = None
         self._n_waiting = 0
@@ -89,6 +107,13 @@ class ScenePanel:
             )
             self._busy = ui.spinner(size="1.4em").classes("oc-busy")
             self._busy.set_visibility(False)
+            self._notation = select(
+                dict(NOTATION_TITLES),
+                state.notation,
+                self._set_notation,
+                label="Acuity as",
+            ).classes("oc-notation")
+            self._notation.set_visibility(False)
         self._problem = problem_label()
         self._uploads()
 
@@ -134,6 +159,15 @@ class ScenePanel:
             text += ". Now upload the photo that this depth belongs to."
         self._used.text = ". Note: ".join((text, *self._notes))
 
+    def _set_notation(self, event: events.ValueChangeEventArguments) -> None:
+        if event.value != self._state.notation:
+            self._state.notation = event.value
+            self._on_notation()
+
+    def show_notation(self) -> None:
+        """Show the notation of the page's state."""
+        self._notation.value = self._state.notation
+
     def choose(self, kind: str) -> None:
         """Select a scene, like a click on its button."""
         self._kinds.value = kind
@@ -141,6 +175,7 @@ class ScenePanel:
     async def _choose(self, event: events.ValueChangeEventArguments) -> None:
         self.kind = event.value
         self._problem.text = ""
+        self._notation.set_visibility(self.kind == "chart")
         self._uploads.refresh()
         await self._show()
 
@@ -253,7 +288,7 @@ class PictureSender:
         self._queued[slot] = self.last[slot] = seen
         self._new_picture.set()
 
-    def is_final(self, side: EyeSide, number: int) -> bool:
+    def is_final(self, side: EyeName, number: int) -> bool:
         """Return whether the full picture of a request was sent or has failed."""
         seen = self.last.get(side)
         return (
@@ -297,7 +332,7 @@ async def _wait_for_disconnect(socket: WebSocket) -> None:
 
 # nicegui, which takes the name of the component, has no types here
 class PictureView(Element, component="picture_view.js"):  # type: ignore[call-arg]
-    """Scene and filtered pictures, with a split between them.
+    """Scene and filtered pictures, or states A and B, with a split between them.
 
     The events ``point`` and ``look`` report the position of the pointer and of a click:
     the eye, and x and y from 0 to 1.
@@ -308,15 +343,18 @@ class PictureView(Element, component="picture_view.js"):  # type: ignore[call-ar
         Address of the websocket that sends the pictures.
     """
 
-    def __init__(self, address: str, eyes: Sequence[EyeSide], aspect: float) -> None:
+    def __init__(self, address: str, aspect: float) -> None:
         super().__init__()
         self.show(
             address=address,
-            eyes=list(eyes),
+            eyes=[],
+            labels_of={},
+            behind_one=False,
             aspect=aspect,
             scene="",
             alts={},
             marks=[],
+            marks_head=[],
             captions={},
             empty="",
         )
@@ -326,8 +364,11 @@ class PictureView(Element, component="picture_view.js"):  # type: ignore[call-ar
 
         Parameters
         ----------
-        eyes : list of str
-            The eyes shown.
+        eyes, labels_of : list of str, dict
+            The eyes or states shown, and their names as displayed.
+        behind_one : bool
+            Whether two states share one split, instead of each having one beside the
+            scene.
         scene, aspect : str, float
             Title of the scene, and the ratio of its width to its height.
         empty : str
@@ -341,32 +382,46 @@ class PictureView(Element, component="picture_view.js"):  # type: ignore[call-ar
         self.update()
 
     def mark_rows(
-        self, picture: Picture, smallest_rows: Mapping[EyeSide, int | None]
+        self,
+        picture: Picture,
+        smallest_rows: Mapping[EyeName, int | None],
+        notation: Notation,
     ) -> None:
         """Label the rows of a chart, and describe the smallest row that each eye reads.
 
         Parameters
         ----------
         smallest_rows : index of the smallest row that each eye can read, or None
+        notation : of acuity, beside logMAR
         """
         right = picture.view.tangents[1]
-        texts = [row_texts(row.log_mar) for row in picture.chart_rows]
+        shown: list[Notation] = list(dict.fromkeys(("log_mar", notation)))
+        texts = [
+            [acuity_text(row.log_mar, each) for each in shown]
+            for row in picture.chart_rows
+        ]
         self.show(
+            marks_head=[COLUMN_HEADS[each] for each in shown],
             marks=[
                 {
                     "y": row.y_px / picture.view.height_px,
                     "x": 0.5
                     + letter_height(row.log_mar) * HALF_WIDTH_HEIGHTS / right / 2.0,
-                    "log_mar": texts[k][0],
-                    "decimal": texts[k][1],
+                    "texts": texts[k],
                     "eyes": [eye for eye, read in smallest_rows.items() if read == k],
                 }
                 for k, row in enumerate(picture.chart_rows)
             ],
             captions={
-                eye: "smallest line read: none of these rows"
-                if read is None
-                else "smallest line read: logMAR {}, decimal {}".format(*texts[read])
+                eye: "smallest line read: "
+                + (
+                    "none of these rows"
+                    if read is None
+                    else ", ".join(
+                        f"{CAPTION_NAMES[each]}{text}"
+                        for each, text in zip(shown, texts[read], strict=True)
+                    )
+                )
                 for eye, read in smallest_rows.items()
             },
         )

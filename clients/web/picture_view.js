@@ -1,8 +1,7 @@
-// The scene and the filtered picture, left and right of a draggable split.
+// The scene and the filtered picture, or states A and B, left and right of a split.
 //
 // Pictures arrive over a separate websocket as a JSON header and an encoded image.  Only
 // the newest is drawn; `window.ocufilter.drawn` lists what was drawn, and when.
-const LABELS = { OD: "Right eye", OS: "Left eye" };
 const SPLIT_STEPS = { ArrowLeft: -2, ArrowDown: -2, ArrowRight: 2, ArrowUp: 2,
   PageDown: -20, PageUp: 20, Home: -100, End: 100 }; // percent
 const POINT_MS = 90; // between two reports of the pointer position
@@ -14,63 +13,79 @@ const LEAST_LINE_PX = 11; // smaller labels are illegible; only the caption is s
 export default {
   template: `
     <div class="oc-stage" ref="stage">
-      <div class="oc-views" :class="{ 'oc-two': eyes.length > 1 }">
-        <div v-for="eye in eyes" :key="eye" class="oc-eye-view">
+      <div class="oc-views" :class="{ 'oc-two': views.length > 1 }">
+        <div v-for="{ eye, left } in views" :key="eye + left" class="oc-eye-view">
           <div class="oc-view" :class="{ 'oc-empty': isEmpty, 'oc-chart': marks.length }" :data-eye="eye"
                :style="frame"
                @pointermove="onMove($event, eye)" @pointerdown="onDown($event, eye)"
                @pointerup="onUp($event, eye)" @pointercancel="dragging = false">
-            <canvas :ref="'before' + eye" class="oc-before" role="img"
-                    :aria-label="'Scene: ' + scene"></canvas>
-            <canvas :ref="'after' + eye" class="oc-after" :style="clip" role="img"
+            <canvas :ref="left + '/' + eye" class="oc-before" role="img"
+                    :aria-label="left === 'scene' ? 'Scene: ' + scene : alts[left] || label(left)"></canvas>
+            <canvas :ref="eye + '/' + eye" class="oc-after" :style="clip" role="img"
                     :aria-label="alts[eye] || label(eye)"></canvas>
+            <canvas v-if="left !== 'scene'" v-show="held === 'scene'" :ref="'scene/' + eye" class="oc-under"
+                    role="img" :aria-label="'Scene: ' + scene"></canvas>
             <template v-if="labels.length">
-              <svg class="oc-leaders" :style="clip" aria-hidden="true">
+              <svg class="oc-leaders" :style="left === 'scene' ? clip : {}" aria-hidden="true">
                 <line v-for="mark in labels" :x1="100 * mark.x + 1 + '%'" :y1="100 * mark.y + '%'"
                       :x2="labelsStart" :y2="mark.top + line / 2"></line>
               </svg>
-              <ol class="oc-marks" :style="{ ...clip, fontSize: 0.75 * line + 'px', lineHeight: line + 'px' }">
-                <li class="oc-marks-head"><span>logMAR</span> <span>dec.</span></li>
+              <ol class="oc-marks" :style="{ ...(left === 'scene' ? clip : {}), fontSize: 0.75 * line + 'px', lineHeight: line + 'px' }">
+                <li class="oc-marks-head"><template v-for="head in marks_head"><span>{{ head }}</span> </template></li>
                 <li v-for="mark in labels" :style="{ top: mark.top + 'px' }"
-                    :class="{ 'oc-read': mark.eyes.includes(eye) }"
-                    ><span>{{ mark.log_mar }}</span> <span>{{ mark.decimal }}</span></li>
+                    :class="{ 'oc-read': readers(mark, eye, left).length }"
+                    ><b v-if="left !== 'scene'">{{ readers(mark, eye, left).map(label).join(" ") }}</b
+                    ><template v-for="text in mark.texts"><span>{{ text }}</span> </template></li>
               </ol>
             </template>
-            <span class="oc-tag oc-tag-left" :style="{ opacity: shownSplit > 12 ? 1 : 0 }">Scene</span>
+            <span class="oc-tag oc-tag-left" :style="{ opacity: shownSplit > 12 ? 1 : 0 }">
+              {{ left === "scene" || held === "scene" ? "Scene" : label(left) }}</span>
             <span class="oc-tag oc-tag-right" :style="{ opacity: shownSplit < 88 ? 1 : 0 }">
               {{ label(eye) }}</span>
             <span class="oc-state" :class="'oc-' + state(eye).kind" :key="state(eye).text">{{ state(eye).text }}</span>
             <span v-if="point && point.eye === eye" class="oc-cross"
                   :style="{ left: 100 * point.x + '%', top: 100 * point.y + '%' }"></span>
             <div class="oc-split" :style="{ left: shownSplit + '%' }" role="slider" tabindex="0"
-                 :aria-label="'Split between the scene and the ' + label(eye).toLowerCase()"
+                 :aria-label="splitName(eye, left)"
                  aria-valuemin="0" aria-valuemax="100" :aria-valuenow="Math.round(split)"
-                 :aria-valuetext="Math.round(split) + ' % scene'"
+                 :aria-valuetext="Math.round(split) + ' % ' + (left === 'scene' ? 'scene' : label(left))"
                  @keydown="onKey"><i></i></div>
           </div>
-          <p v-if="captions[eye] && !isEmpty" class="oc-caption">{{ label(eye) }}: {{ captions[eye] }}</p>
+          <template v-if="!isEmpty" v-for="name in left === 'scene' ? [eye] : [left, eye]">
+            <p v-if="captions[name]" class="oc-caption">{{ label(name) }}: {{ captions[name] }}</p>
+          </template>
         </div>
       </div>
       <div class="oc-view-tools">
-        <button type="button" class="oc-tool" @pointerdown="hold(true)" @pointerup="hold(false)"
-                @pointerleave="hold(false)" @keydown.space.prevent="hold(true)"
-                @keyup.space="hold(false)" @keydown.enter.prevent="hold(true)"
-                @keyup.enter="hold(false)" @blur="hold(false)" :aria-pressed="held"
-                >Hold to see the scene</button>
+        <button v-for="name in holdable" type="button" class="oc-tool" @pointerdown="hold(name)"
+                @pointerup="hold('')" @pointercancel="hold('')" @contextmenu.prevent
+                @pointerleave="hold('')" @keydown.space.prevent="hold(name)"
+                @keyup.space="hold('')" @keydown.enter.prevent="hold(name)"
+                @keyup.enter="hold('')" @blur="hold('')" :aria-pressed="held === name"
+                >Hold to see {{ name === "scene" ? "the scene" : label(name) }}</button>
         <button type="button" class="oc-tool" @click="fill">Full screen</button>
+        <slot></slot>
       </div>
     </div>`,
-  props: { address: String, eyes: Array, aspect: Number, scene: String, alts: Object, marks: Array,
-    captions: Object, empty: String },
+  props: { address: String, eyes: Array, labels_of: Object, behind_one: Boolean, aspect: Number,
+    scene: String, alts: Object, marks: Array, marks_head: Array, captions: Object, empty: String },
   data() {
-    return { hasScene: false, height: 0, width: 0, split: 50, held: false, dragging: false, point: null, states: {}, down: null };
+    return { hasScene: false, height: 0, width: 0, split: 50, held: "", dragging: false, point: null, states: {}, down: null };
   },
   computed: {
     frame() {
       return { aspectRatio: this.aspect, maxWidth: `calc(var(--tallest) * var(--share) * ${this.aspect})` };
     },
+    views() { // what is left and right of each split
+      if (this.behind_one) return [{ eye: this.eyes[1], left: this.eyes[0] }];
+      return this.eyes.map((eye) => ({ eye, left: "scene" }));
+    },
+    holdable() {
+      return this.behind_one ? [...this.eyes, "scene"] : ["scene"];
+    },
     shownSplit() {
-      return this.held ? 100 : this.split;
+      if (!this.held) return this.split;
+      return this.behind_one && this.held === this.eyes[1] ? 0 : 100;
     },
     clip() {
       return { clipPath: `inset(0 0 0 ${this.shownSplit}%)` };
@@ -117,13 +132,23 @@ export default {
     this.socket?.close();
   },
   watch: {
-    eyes() {
-      this.$nextTick(() => Object.values(this.latest).forEach((m) => this.drawNext(m)));
+    views() {
+      this.$nextTick(() => {
+        this.measure();
+        Object.values(this.latest).forEach((m) => this.drawNext(m));
+      });
     },
   },
   methods: {
     label(eye) {
-      return LABELS[eye];
+      return this.labels_of[eye] ?? "";
+    },
+    splitName(eye, left) {
+      if (left !== "scene") return `Split between ${this.label(left)} and ${this.label(eye)}`;
+      return `Split between the scene and the ${this.label(eye).toLowerCase()}`;
+    },
+    readers(mark, eye, left) { // states whose smallest row this is
+      return [left, eye].filter((name) => mark.eyes.includes(name));
     },
     measure() {
       const view = this.$el.querySelector(".oc-view");
@@ -165,9 +190,8 @@ export default {
       }
       const bitmap = await createImageBitmap(new Blob([data]));
       if (this.latest[slot] !== message) return bitmap.close();
-      const eyes = header.eye ? [header.eye] : this.eyes;
-      for (const eye of eyes) {
-        const canvas = this.$refs[(header.eye ? "after" : "before") + eye]?.[0];
+      for (const { eye } of this.views) {
+        const canvas = this.$refs[`${slot}/${eye}`]?.[0];
         if (!canvas) continue;
         canvas.width = bitmap.width;
         canvas.height = bitmap.height;
@@ -189,8 +213,10 @@ export default {
       for (const eye of this.eyes) {
         const message = this.latest[eye];
         if (message && message.header.number >= this.latest.scene.header.number) continue;
-        const canvas = this.$refs["after" + eye]?.[0];
-        if (canvas) canvas.width = canvas.width;
+        for (const view of this.views) {
+          const canvas = this.$refs[`${eye}/${view.eye}`]?.[0];
+          if (canvas) canvas.width = canvas.width;
+        }
         delete this.latest[eye];
         delete this.states[eye];
       }

@@ -10,7 +10,13 @@ export default {
     <div class="oc-slider" :class="{ 'oc-off': disabled }">
       <div v-if="text" class="oc-slider-head">
         <label :for="id">{{ label }}</label>
-        <span class="oc-value" aria-hidden="true">{{ text }}</span>
+        <input v-if="typing" ref="typed" type="text" class="oc-typed" :aria-label="label + ', typed'"
+               :value="text" @keydown.enter="take" @keydown.esc="typing = false" @blur="take">
+        <template v-else>
+          <span class="oc-value" aria-hidden="true">{{ text }}</span>
+          <button type="button" class="oc-type" :disabled="disabled" :aria-label="'Type ' + label"
+                  @click="type">✎</button>
+        </template>
       </div>
       <input type="range" :id="id" :data-name="name" :min="min" :max="max" :step="step"
              :value="current" :disabled="disabled" :aria-label="text ? null : label"
@@ -23,6 +29,7 @@ export default {
   data() {
     return {
       current: this.value,
+      typing: false,
       sent: this.answered, // number of the last report
       id: `oc-range-${Math.random().toString(36).slice(2)}`,
     };
@@ -38,6 +45,15 @@ export default {
     onInput(event) {
       this.current = Number(event.target.value);
       this.report();
+    },
+    type() {
+      this.typing = true;
+      this.$nextTick(() => this.$refs.typed.select());
+    },
+    take(event) {
+      if (!this.typing) return; // Enter also takes the focus away
+      this.typing = false;
+      if (event.target.value !== this.text) this.$emit("typed", event.target.value);
     },
     onKey(event) {
       const steps = { PageUp: PAGE_STEPS, PageDown: -PAGE_STEPS }[event.key];

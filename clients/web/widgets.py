@@ -18,6 +18,9 @@ MAX_REPORTS = 2**53
 """Largest report number that a browser represents exactly."""
 
 
+MAX_TYPED_CHARACTERS = 40
+
+
 class Delayed:
     """A call after a delay; a newer one replaces it."""
 
@@ -46,6 +49,29 @@ def card(label: str, kind: str = "") -> ui.element:
 def title(text: str, tag: str = "h2", kind: str = "oc-title") -> ui.html:
     """Return a heading."""
     return ui.html(text, tag=tag, sanitize=False).classes(kind)
+
+
+def switch(label: str, value: bool, on_change: Callable[..., Any]) -> ui.switch:
+    """Return a switch."""
+    found = ui.switch(label, value=value, on_change=on_change)
+    return found.props("dense").classes("oc-switch")
+
+
+def small_button(label: str, on_click: Callable[..., Any]) -> ui.button:
+    """Return a button of a group."""
+    button = ui.button(label, on_click=on_click).props("outline dense no-caps size=sm")
+    return button.classes("oc-download")
+
+
+def help_button(subject: str, text: str) -> ui.button:
+    """Return a button that opens an explanation."""
+    with ui.button("?").props(
+        f'flat dense round size=sm aria-label="Help: {subject}"'
+    ) as button:
+        button.classes("oc-help")
+        with ui.menu().props('max-width="340px"'):
+            ui.label(text).classes("oc-help-text")
+    return button
 
 
 def problem_label() -> ui.label:
@@ -123,6 +149,7 @@ class SliderRow(Element, component="range_slider.js"):  # type: ignore[call-arg]
         )
         self.show(value)
         self.on("move", lambda event: self._moved(event.args))
+        self.on("typed", lambda event: self._typed(event.args))
 
     def _moved(self, sent: object) -> None:
         match sent:
@@ -132,6 +159,16 @@ class SliderRow(Element, component="range_slider.js"):  # type: ignore[call-arg]
                 self._props["answered"] = min(report_number, MAX_REPORTS)
                 self.show(self.number.clamped(value))
                 self._on_move(self.number.name, self._props["value"])
+
+    def _typed(self, sent: object) -> None:
+        """Take a typed text, with or without a unit."""
+        try:
+            value = self.number.read_typed(str(sent)[:MAX_TYPED_CHARACTERS])
+        except ValueError as error:
+            warn(f"{self.number.label}: {error}")
+            return
+        self.show(value)
+        self._on_move(self.number.name, value)
 
     def show(self, value: float) -> None:
         """Show a value."""

@@ -1,0 +1,171 @@
+"""Two states of one person, A and B: names of what is shown, and what differs.
+
+A is the person's eye as entered; B starts as a copy of it.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+
+from clients.web.controls import AGE, CONDITIONS, CORRECTION, PRESCRIPTION, NumberField
+from clients.web.eye_form import DESIGNS, KINDS, SIDES, EyeSide, preset_titles
+from clients.web.picture import png_of
+
+EyeName = Literal["OD", "OS", "OD_B", "OS_B"]
+"""An eye that is shown: one of the person, or state B of one."""
+
+B_OF: dict[EyeSide, EyeName] = {"OD": "OD_B", "OS": "OS_B"}
+EYE_NAMES: tuple[EyeName, ...] = ("OD", "OS", "OD_B", "OS_B")
+
+CORRECTION_PREFIX = "correction."
+NONE = "none"
+
+_FIELDS: dict[str, NumberField] = {
+    field.name: field for field in (*CONDITIONS, *CORRECTION, *PRESCRIPTION)
+}
+_LABELS = {
+    "kind": "Kind of entries",
+    "name": "Preset",
+    "higher_order": "Higher-order aberrations of this age",
+    "correction": "Correction",
+    "correction.kind": "Correction",
+    "correction.design": "Design",
+    "straylight.log_s": "Straylight",
+    "straylight.cataract": "Cataract",
+    "yellowing": "Yellowing of the lens",
+}
+_LABEL_HEIGHT_PX, _GAP_PX = 36, 8
+
+
+class Difference(NamedTuple):
+    """An entry that differs between A and B.
+
+    Attributes
+    ----------
+    path : name of the profile field, within the correction with a prefix
+    label, a, b : as displayed
+    """
+
+    path: str
+    label: str
+    a: str
+    b: str
+
+
+def side_of(name: EyeName) -> EyeSide:
+    """Return which eye of the person a name belongs to."""
+    return "OD" if name.startswith("OD") else "OS"
+
+
+def title_of(name: EyeName, *, is_comparing: bool) -> str:
+    """Return the name of an eye as displayed."""
+    if not is_comparing:
+        return SIDES[side_of(name)]
+    return "B" if name.endswith("_B") else "A"
+
+
+def differences(a: Mapping[str, Any], b: Mapping[str, Any]) -> list[Difference]:
+    """Return the fields in which two profiles differ.
+
+    A correction that only one of them has is one difference.
+    """
+    flat_a, flat_b = _flat(a), _flat(b)
+    if ("correction" in a) != ("correction" in b):
+        for flat in (flat_a, flat_b):
+            shown = _correction_text(flat)
+            for path in [path for path in flat if path.startswith(CORRECTION_PREFIX)]:
+                del flat[path]
+            flat["correction"] = shown
+    paths = dict.fromkeys((*flat_a, *flat_b))
+    return [
+        Difference(path, _label(path), _text(path, flat_a), _text(path, flat_b))
+        for path in paths
+        if flat_a.get(path) != flat_b.get(path)
+    ]
+
+
+def _flat(body: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Return the fields of a profile by their path."""
+    found: dict[str, Any] = {}
+    if prefix == CORRECTION_PREFIX:
+        found[f"{prefix}kind"] = "spectacles"  # without a kind
+    for name, value in body.items():
+        if isinstance(value, Mapping):
+            found |= _flat(value, f"{prefix}{name}.")
+        else:
+            found[prefix + name] = value
+    return found
+
+
+def _correction_text(flat: Mapping[str, Any]) -> str:
+    kind = flat.get("correction.kind")
+    if kind is None:
+        return NONE
+    parts = [KINDS.get(kind, kind)]
+    if "correction.design" in flat:
+        parts.append(_text("correction.design", flat).lower())
+    sphere_dpt = flat.get("correction.sphere_dpt")
+    if sphere_dpt:
+        parts.append(_text("correction.sphere_dpt", flat))
+    return ", ".join(parts)
+
+
+def _label(path: str) -> str:
+    if path in _LABELS:
+        return _LABELS[path]
+    name = path.removeprefix(CORRECTION_PREFIX)
+    label = _FIELDS[name].label if name in _FIELDS else name.replace("_", " ")
+    is_worn = path.startswith(CORRECTION_PREFIX)
+    return f"{label} of the correction" if is_worn else label
+
+
+def _text(path: str, flat: Mapping[str, Any]) -> str:
+    """Return a value as displayed."""
+    if path not in flat:
+        return NONE
+    value, name = flat[path], path.rpartition(".")[2]
+    if name in _FIELDS and isinstance(value, int | float):
+        return _FIELDS[name].describe(value)
+    known: Mapping[str, str] = {}
+    if path == "name":
+        known = preset_titles()
+    elif path.startswith(CORRECTION_PREFIX):
+        known = dict(KINDS) | DESIGNS
+    return known.get(value, str(value)) if isinstance(value, str) else f"{value}"
+
+
+def joined_png(pictures: Sequence[bytes], labels: Sequence[str]) -> bytes:
+    """Return encoded pictures of one height beside each other, each with its label."""
+    decoded: list[Image.Image] = []
+    for data in pictures:
+        with Image.open(io.BytesIO(data)) as image:
+            decoded.append(image.convert("RGB"))
+    height_px = max(image.height for image in decoded)
+    width_px = sum(image.width for image in decoded) + _GAP_PX * (len(decoded) - 1)
+    sheet = Image.new("RGB", (width_px, height_px + _LABEL_HEIGHT_PX), "white")
+    draw, left_px = ImageDraw.Draw(sheet), 0
+    font = ImageFont.load_default(20)
+    for picture, label in zip(decoded, labels, strict=True):
+        sheet.paste(picture, (left_px, 0))
+        draw.text((left_px + 6, height_px + 6), label, fill="black", font=font)
+        left_px += picture.width + _GAP_PX
+    return png_of(np.asarray(sheet))
+
+
+def label_of(name: EyeName, body: Mapping[str, Any]) -> str:
+    """Return a line about a state for a picture: its letter, refraction and lens."""
+    flat = _flat(body)
+    parts = [f"{title_of(name, is_comparing=True)}: {SIDES[side_of(name)].lower()}"]
+    if "name" in flat and flat.get("kind") == "preset":
+        parts.append(_text("name", flat))
+    if flat.get("sphere_dpt"):
+        parts.append(_text("sphere_dpt", flat))
+    parts.append(f"correction: {_correction_text(flat)}")
+    if AGE.name in flat:
+        parts.append(_text(AGE.name, flat))
+    return ", ".join(parts)
