@@ -11,6 +11,7 @@ comparison     states A and B of one person: names, differences, a joined pictur
 eye_form       entries of an eye and its correction, and the resulting profile
 eye_panel      those entries on the page
 eyes_card      which eyes and states are shown, with the panels of their entries
+scenario_menu  scenarios, each with its scene, conditions, and states A and B
 picture        pictures with depth: scenes, glTF files, photos, a letter chart
 picture_panel  scene and filtered picture with a split, with picture_view.js
 figure_panel   point-spread function under the pointer, and figures of the eye

@@ -8,7 +8,7 @@ from functools import partial
 from nicegui import events, ui
 
 from clients.web.comparison import EyeName
-from clients.web.controls import AGE, AGE_B, NumberField
+from clients.web.controls import AGE, NumberField
 from clients.web.eye_form import SIDES
 from clients.web.eye_panel import EyePanel
 from clients.web.page_state import PageState
@@ -89,7 +89,9 @@ class EyesCard:
             )
             self._difference = ui.label("").classes("oc-hint oc-difference")
             self._difference.props("aria-live=polite")
-            self._ages = {number: add_slider(number) for number in (AGE, AGE_B)}
+            self._add_slider = add_slider
+            self._ages = {AGE: add_slider(AGE)}
+            self._age_b = ui.element("div")
             self._box = ui.element("div")
             self._panels: dict[EyeName, EyePanel] = {}
             for name in SIDES:
@@ -99,6 +101,10 @@ class EyesCard:
 
     def _add_panel(self, name: EyeName) -> None:
         """Add the entries of an eye or state, unless they are there."""
+        number = self._state.age(name)
+        if number not in self._ages:
+            with self._age_b:
+                self._ages[number] = self._add_slider(number)
         if name not in self._panels:
             with self._box:
                 form = self._state.form(name)

@@ -125,7 +125,10 @@ class EyeView:
                 view = coarser(view, self._merge_factor)
         settings = settings.covering(foci_dpt=(request.focus_dpt,))
         if kind not in self._filters:
-            self._filters[kind] = EyeFilter()
+            # A preview's eye is a formula, prepared in this thread within milliseconds.
+            # In the worker it would wait for the estimate of an outdated full picture,
+            # or for a new process if that had to be killed: up to 6 s.
+            self._filters[kind] = EyeFilter(worker=kind != "preview")
         eye_filter, profile = self._filters[kind], (body, settings, view.camera)
         try:
             if profile != self._profiles.get(kind):

@@ -36,6 +36,7 @@ from clients.web.header import Header
 from clients.web.page_state import SCENES, PageState, restore
 from clients.web.picture import Picture, SceneNotRendered, png_of, scene_picture
 from clients.web.picture_panel import PictureSender, PictureView, ScenePanel
+from clients.web.scenario_menu import ScenarioMenu
 from clients.web.widgets import (
     Delayed,
     SliderRow,
@@ -183,6 +184,8 @@ class Page:
                 self.scene = ScenePanel(
                     state, self._set_picture, self._set_empty, self._mark_rows
                 )
+                self.scenarios = ScenarioMenu(state, self._start_scenario)
+            self.scene.build_uploads()
             self.view = PictureView(PICTURES_PATH + self.name, DEFAULT_ASPECT)
             self.view.on("point", self._point)
             self.view.on("look", self._focus)
@@ -199,6 +202,7 @@ class Page:
                     self._note = ui.label("").classes("oc-note")
                     self._note.props("aria-live=polite")
                 help_button("the picture", PICTURE_HELP)
+            self.scenarios.build_text()
             self._scene_problem = problem_label()
             self._show_views()
 
@@ -249,10 +253,8 @@ class Page:
     def _restore(self, fragment: str) -> None:
         """Restore the entries from a fragment of the address."""
         found = restore(self.state, fragment)
+        self.scenarios.clear()
         self._show_entries()
-        self._pipelines.value = self.state.pipeline
-        self._arrangement.value = self.state.arrangement
-        self.scene.show_notation()
         self._show_views()
         self._scene_problem.text = " ".join(found.problems)
         # links never contain a photo: keep it unless the link selects another scene
@@ -261,6 +263,15 @@ class Page:
             self.request()
         else:
             self.scene.choose(found.scene)
+
+    def _start_scenario(self, scene: str) -> None:
+        """Show the entries of a scenario, and its scene."""
+        self._show_entries()
+        self._show_views()
+        if self.scene.kind == scene:
+            self.request()
+        else:
+            self.scene.choose(scene)
 
     def _show_values(self) -> None:
         for name, row in self.rows.items():
@@ -271,6 +282,9 @@ class Page:
         """Show all entries after changes that were not made in the panels."""
         self.eyes.refresh()
         self._show_values()
+        self._pipelines.value = self.state.pipeline
+        self._arrangement.value = self.state.arrangement
+        self.scene.show_notation()
 
     def _change_eye(self) -> None:
         """Request a picture if a profile has changed; report invalid entries."""

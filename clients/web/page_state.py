@@ -76,7 +76,7 @@ MAX_CHARACTERS = 8000
 """Length limit of a fragment; every entry of both eyes takes 1,600 characters."""
 
 MAX_ENTRY_CHARACTERS = 40
-SCENES = ("courtyard", "primitives", "chart")
+SCENES = ("courtyard", "primitives", "night_road", "stairs", "chart")
 """Scenes that need no file; a new page shows the first one."""
 
 

@@ -46,7 +46,12 @@ SIZE_PX = (960, 540)
 
 GLTF_SUFFIXES = (".glb", ".gltf")
 MAX_GLTF_BYTES = 200_000_000
-TITLES = {"courtyard": "Courtyard", "primitives": "Primitives"}
+TITLES = {
+    "courtyard": "Courtyard",
+    "primitives": "Shapes",
+    "night_road": "Night road",
+    "stairs": "Stairs",
+}
 _CHECKOUT = Path(__file__).resolve().parents[2]
 # In a checkout, `-m` requires this folder; installed packages need none.
 _FOLDER = _CHECKOUT if (_CHECKOUT / "pyproject.toml").is_file() else None
@@ -163,13 +168,14 @@ def coarser(view: RgbdView, n: int) -> RgbdView:
     height_px, width_px = view.height_px // n, view.width_px // n
     blocks = (height_px, n, width_px, n)
     cut = (slice(height_px * n), slice(width_px * n))
-    light = linear_from_srgb8(cast("NDArray[np.uint8]", view.color)[cut])
+    light = linear_light(view.color[cut])
     mean = light.reshape(*blocks, 3).mean(axis=(1, 3))
     depth_m = view.depth_m[cut].reshape(blocks)
     valid_m = np.where(depth_m > 0.0, depth_m, np.inf)
     left, right, up, down = view.tangents
+    is_linear = view.color.dtype != np.uint8
     return RgbdView(
-        srgb8_from_linear(mean),
+        mean if is_linear else srgb8_from_linear(mean),
         valid_m.min(axis=(1, 3)).astype(np.float32),
         (
             left,
@@ -186,22 +192,36 @@ def linear_from_srgb8(color: NDArray[np.uint8]) -> NDArray[np.float32]:
     return linear_from_srgb(np.arange(256) / 255.0).astype(np.float32)[color]
 
 
+def linear_light(color: NDArray[Any]) -> NDArray[np.float32]:
+    """Return the linear light of 8-bit sRGB, or of a picture that has it already."""
+    return linear_from_srgb8(color) if color.dtype == np.uint8 else color
+
+
+def shown_srgb8(color: NDArray[Any]) -> NDArray[np.uint8]:
+    """Return a picture as a display shows it: lamps brighter than white are white."""
+    if color.dtype == np.uint8:
+        return color
+    return srgb8_from_linear(np.clip(color, 0.0, 1.0))
+
+
 def srgb8_from_linear(light: NDArray[np.float32]) -> NDArray[np.uint8]:
     """Return 8-bit sRGB."""
     return np.round(255.0 * srgb_from_linear(cast("Any", light))).astype(np.uint8)
 
 
 def png_of(color: NDArray[Any], *, level: int = PNG_LEVEL) -> bytes:
-    """Return a picture (h, w, 3) as a PNG, lossless."""
+    """Return a picture (h, w, 3), sRGB or linear light, as a lossless PNG."""
     file = io.BytesIO()
-    Image.fromarray(color).save(file, "png", compress_level=level)
+    Image.fromarray(shown_srgb8(color)).save(file, "png", compress_level=level)
     return file.getvalue()
 
 
 def jpeg_of(color: NDArray[Any]) -> bytes:
     """Return a picture (h, w, 3) as a JPEG without color subsampling."""
     file = io.BytesIO()
-    Image.fromarray(color).save(file, "jpeg", quality=PREVIEW_QUALITY, subsampling=0)
+    Image.fromarray(shown_srgb8(color)).save(
+        file, "jpeg", quality=PREVIEW_QUALITY, subsampling=0
+    )
     return file.getvalue()
 
 
@@ -445,7 +465,7 @@ def main(source: str, file: str) -> int:
     if is_built_in:
         (moment,) = path_moments(PATHS[source], 1)
         state = (moment.pupil_diameter_mm, moment.focus_dpt)
-    with SceneRenderer(scene, SIZE_PX) as renderer:
+    with SceneRenderer(scene, SIZE_PX, is_linear=scene.is_hdr) as renderer:
         seen, hidden = renderer.render_layers(viewpoint(scene))
         arrays: dict[str, Any] = {
             "color": seen[0],

@@ -41,7 +41,12 @@ from clients.web.widgets import (
     upload_entry,
 )
 
-KINDS = {**TITLES, "chart": "Letter chart", "photo": "Photo", "gltf": "3D file"}
+KINDS = {
+    **TITLES,
+    "chart": "Letter chart",
+    "photo": "Photo",
+    "gltf": "3D file",
+}
 PHOTO_WIDTHS_DEG = {20: "20° wide", 35: "35° wide", 50: "50° wide", 70: "70° wide"}
 NamedFile = tuple[str, bytes]
 
@@ -114,6 +119,9 @@ class ScenePanel:
                 label="Acuity as",
             ).classes("oc-notation")
             self._notation.set_visibility(False)
+
+    def build_uploads(self) -> None:
+        """Build the uploads of a photo or a 3D file, which the scene may need."""
         self._problem = problem_label()
         self._uploads()
 

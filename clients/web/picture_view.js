@@ -31,11 +31,11 @@ export default {
                       :x2="labelsStart" :y2="mark.top + line / 2"></line>
               </svg>
               <ol class="oc-marks" :style="{ ...(left === 'scene' ? clip : {}), fontSize: 0.75 * line + 'px', lineHeight: line + 'px' }">
-                <li class="oc-marks-head"><template v-for="head in marks_head"><span>{{ head }}</span> </template></li>
+                <li class="oc-marks-head"><template v-for="head in marks_head"><span>{{ head }}</span>{{ " " }}</template></li>
                 <li v-for="mark in labels" :style="{ top: mark.top + 'px' }"
                     :class="{ 'oc-read': readers(mark, eye, left).length }"
-                    ><b v-if="left !== 'scene'">{{ readers(mark, eye, left).map(label).join(" ") }}</b
-                    ><template v-for="text in mark.texts"><span>{{ text }}</span> </template></li>
+                    ><b v-if="left !== 'scene'">{{ readers(mark, eye, left).map(label).join(" ") + " " }}</b
+                    ><template v-for="text in mark.texts"><span>{{ text }}</span>{{ " " }}</template></li>
               </ol>
             </template>
             <span class="oc-tag oc-tag-left" :style="{ opacity: shownSplit > 12 ? 1 : 0 }">

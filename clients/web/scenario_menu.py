@@ -1,0 +1,72 @@
+"""Menu of scenarios: one choice sets scene, conditions, and states A and B."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from nicegui import events, ui
+
+from clients.scenarios import Scenario, scenarios
+from clients.web.comparison import B_OF
+from clients.web.controls import DISTANCE, FOCUS, GAZE_H, GAZE_V, PUPIL, NumberField
+from clients.web.page_state import PageState
+from clients.web.widgets import select
+
+CHOOSE = "choose"
+
+
+def start(state: PageState, scenario: Scenario) -> None:
+    """Set the entries of a page to those of a scenario."""
+    notation = state.notation
+    state.reset()
+    state.notation = notation
+    gaze_h_deg, gaze_v_deg = scenario.gaze_deg
+    values: dict[NumberField, float] = {
+        PUPIL: scenario.pupil_diameter_mm,
+        FOCUS: scenario.focus_dpt,
+        DISTANCE: scenario.focus_dpt,
+        GAZE_H: gaze_h_deg,
+        GAZE_V: gaze_v_deg,
+    }
+    state.values |= {number.name: number.clamped(v) for number, v in values.items()}
+    side = state.sides[0]
+    for name, one in ((side, scenario.a), (B_OF[side], scenario.b)):
+        state.load_body(name, one.profile, one.title)
+    state.wants_comparison = True
+
+
+class ScenarioMenu:
+    """A list of scenarios, and two sentences about the chosen one.
+
+    Parameters
+    ----------
+    on_start : called with the scene of a scenario that was chosen
+    """
+
+    def __init__(self, state: PageState, on_start: Callable[[str], None]) -> None:
+        self._state, self._on_start = state, on_start
+        titles = {name: scenario.title for name, scenario in scenarios().items()}
+        self._list = select(
+            {CHOOSE: "Choose one", **titles}, CHOOSE, self._choose, label="Scenarios"
+        ).classes("oc-scenarios")
+
+    def build_text(self) -> None:
+        """Build the sentences about the scenario."""
+        self._text = ui.label("").classes("oc-hint oc-scenario-text")
+        self._text.set_visibility(False)
+
+    def _choose(self, event: events.ValueChangeEventArguments) -> None:
+        scenario = scenarios().get(event.value)
+        self._text.set_visibility(scenario is not None)
+        if scenario is None:
+            return
+        self._text.text = (
+            f"A: {scenario.a.title}. B: {scenario.b.title}. "
+            f"{scenario.sees} {scenario.leaves_out}"
+        )
+        start(self._state, scenario)
+        self._on_start(scenario.scene)
+
+    def clear(self) -> None:
+        """Forget the scenario, for example when a link was followed."""
+        self._list.value = CHOOSE
