@@ -16,6 +16,7 @@ import struct
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -290,7 +291,13 @@ class FilterThread:
         self._thread.join()
 
     def _run(self) -> None:
+        # The worker process ends with the last filter that uses it, and starting
+        # another takes seconds.
+        keeper: EyeFilter | None = None
         while not self._is_closed:
+            if keeper is None and self._pages:
+                with suppress(FilterError):  # the pages' own filters report it
+                    keeper = EyeFilter()
             self._wake.clear()
             while self._closing_pages:
                 self._closing_pages.pop().close()
@@ -298,6 +305,8 @@ class FilterThread:
             self._wake.wait(min(waits_s, default=None))
         for page in [*self._pages.values(), *self._closing_pages]:
             page.close()
+        if keeper is not None:
+            keeper.close()
 
     def _step_all(self) -> Iterator[float]:
         for page in list(self._pages.values()):
