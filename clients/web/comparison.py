@@ -72,10 +72,14 @@ def title_of(name: EyeName, *, is_comparing: bool) -> str:
 def differences(a: Mapping[str, Any], b: Mapping[str, Any]) -> list[Difference]:
     """Return the fields in which two profiles differ.
 
-    A correction that only one of them has is one difference.
+    Corrections of different kinds or designs are one difference.
     """
     flat_a, flat_b = _flat(a), _flat(b)
-    if ("correction" in a) != ("correction" in b):
+    kinds = [
+        tuple(flat.get(f"{CORRECTION_PREFIX}{field}") for field in ("kind", "design"))
+        for flat in (flat_a, flat_b)
+    ]
+    if kinds[0] != kinds[1]:
         for flat in (flat_a, flat_b):
             shown = _correction_text(flat)
             for path in [path for path in flat if path.startswith(CORRECTION_PREFIX)]:
@@ -94,6 +98,8 @@ def _flat(body: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     found: dict[str, Any] = {}
     if prefix == CORRECTION_PREFIX:
         found[f"{prefix}kind"] = "spectacles"  # without a kind
+    if "sphere_dpt" in body:
+        found |= {f"{prefix}cylinder_dpt": 0.0, f"{prefix}axis_deg": 0.0}
     for name, value in body.items():
         if isinstance(value, Mapping):
             found |= _flat(value, f"{prefix}{name}.")
@@ -107,8 +113,9 @@ def _correction_text(flat: Mapping[str, Any]) -> str:
     if kind is None:
         return NONE
     parts = [KINDS.get(kind, kind)]
-    if "correction.design" in flat:
-        parts.append(_text("correction.design", flat).lower())
+    if kind == "iol":
+        design = flat.get("correction.design", "monofocal")
+        parts.append(DESIGNS.get(design, design).lower())
     sphere_dpt = flat.get("correction.sphere_dpt")
     if sphere_dpt:
         parts.append(_text("correction.sphere_dpt", flat))
@@ -129,6 +136,8 @@ def _text(path: str, flat: Mapping[str, Any]) -> str:
     if path not in flat:
         return NONE
     value, name = flat[path], path.rpartition(".")[2]
+    if isinstance(value, list | tuple):
+        return ", ".join(f"{part:g}" for part in value)
     if name in _FIELDS and isinstance(value, int | float):
         return _FIELDS[name].describe(value)
     known: Mapping[str, str] = {}

@@ -76,18 +76,18 @@ Haze = Literal[
     "none", "age", "nuclear", "cortical", "posterior_subcapsular", "measured"
 ]
 HAZES: dict[Haze, str] = {
-    "none": "No straylight",
-    "age": "Straylight of this age",
+    "none": "None",
+    "age": "Of this age",
     "nuclear": "Nuclear cataract",
     "cortical": "Cortical cataract",
     "posterior_subcapsular": "Posterior subcapsular cataract",
-    "measured": "Measured straylight",
+    "measured": "Measured",
 }
 Yellowing = Literal["none", "seen", "adapted"]
 YELLOWINGS: dict[Yellowing, str] = {
-    "none": "No yellowing of the lens",
-    "seen": "Yellowing of this age",
-    "adapted": "Yellowing of this age, adapted to white",
+    "none": "None",
+    "seen": "Of this age",
+    "adapted": "Adapted to white",
 }
 YOUNG_YEARS = 25.0
 """Age of the eye to which straylight is compared."""

@@ -16,14 +16,17 @@ from clients.web.controls import (
     PRESCRIPTION,
     SPHERE,
     SPHERE_SLIDER,
+    STRAYLIGHT,
     NumberField,
     prescription_texts,
 )
 from clients.web.eye_form import (
     DESIGNS,
     DISTANCE_KINDS,
+    HAZES,
     HINTS,
     SIDES,
+    YELLOWINGS,
     EyeForm,
     preset_titles,
 )
@@ -31,6 +34,10 @@ from clients.web.widgets import SliderRow, select, switch, title, toggle, upload
 from estimator import MAX_PROFILE_BYTES, PROFILE_SUFFIXES
 
 SOURCES = {"prescription": "Prescription", "preset": "Preset", "file": "File"}
+
+NO_HIGHER_ORDER = (
+    "Without aberrations of the age: the prescription is that after lens surgery."
+)
 
 TYPING_MS = 400
 """Pause after which a typed number is used; an incomplete one would be another eye."""
@@ -45,6 +52,7 @@ class EyePanel:
     ----------
     name : of the eye or state
     on_change : called when the entries have changed and are valid
+    age_years : returns the age of the person
     on_file : called with the eye, and the name and content of an uploaded profile file
     """
 
@@ -53,10 +61,12 @@ class EyePanel:
         name: EyeName,
         form: EyeForm,
         on_change: Callable[[], None],
+        age_years: Callable[[], float],
         on_file: Callable[[EyeName, str, bytes], Awaitable[None]],
     ) -> None:
         self.name, self.form = name, form
         self._on_change, self._on_file = on_change, on_file
+        self._age_years = age_years
         self._entries: dict[tuple[str, bool], ui.input] = {}
         self._choices: dict[str, ui.element] = {}  # by profile field
         self._marked: Collection[str] = ()
@@ -82,20 +92,18 @@ class EyePanel:
         if form.source == "prescription":
             self._prescription()
         elif form.source == "preset":
-            self._choices["name"] = (
-                select(
-                    preset_titles(),
-                    form.preset,
-                    self._takes(partial(setattr, form, "preset"), rebuilds=False),
-                    label="Preset",
-                )
-                .classes("oc-wide")
-                .mark("preset")
+            preset = select(
+                preset_titles(),
+                form.preset,
+                self._takes(form.choose_preset),
+                label="Preset",
             )
+            self._choices["name"] = preset.classes("oc-wide").mark("preset")
         else:
             self._file()
         if form.loaded_name and form.source != "file":
             ui.label(f"Loaded: {form.loaded_name}").classes("oc-hint")
+        self._media()
         ui.separator()
         self._correction()
         self.mark(self._marked)
@@ -103,6 +111,8 @@ class EyePanel:
     def mark(self, paths: Collection[str]) -> None:
         """Mark the entries of some profile fields: those that differ from A to B."""
         self._marked = paths
+        if "correction" in paths:
+            paths = {*paths, "correction.kind", "correction.design"}
         elements = {
             f"{CORRECTION_PREFIX if is_worn else ''}{field}": entry
             for (field, is_worn), entry in self._entries.items()
@@ -124,9 +134,14 @@ class EyePanel:
             sphere.on_value_change(lambda event: slider.show(_position(event.value)))
             for number in PRESCRIPTION[1:]:
                 self._entry(number, form.texts)
-        self._choices["higher_order"] = self._switch(
-            "Higher-order aberrations of this age", "has_higher_order", rebuilds=False
-        )
+        if form.applies_higher_order:
+            self._choices["higher_order"] = self._switch(
+                "Higher-order aberrations of this age",
+                "has_higher_order",
+                rebuilds=False,
+            )
+        else:
+            ui.label(NO_HIGHER_ORDER).classes("oc-hint")
 
     def _entry(
         self, number: NumberField, texts: dict[str, str], *, is_worn: bool = False
@@ -189,6 +204,31 @@ class EyePanel:
         ).classes("oc-wide").mark("profile-file")
         text = f"In use: {form.file_name}" if form.file_name else ""
         ui.label(text or f"A profile: {suffixes}").classes("oc-hint")
+
+    def _media(self) -> None:
+        """Show the entries of straylight and yellowing."""
+        form = self.form
+        with ui.element("div").classes("oc-fields"):
+            for options, name, label, field in (
+                (HAZES, "haze", "Straylight", "straylight"),
+                (YELLOWINGS, "yellowing", "Yellowing", "yellowing"),
+            ):
+                entry = select(
+                    options,
+                    getattr(form, name),
+                    self._takes(partial(setattr, form, name)),
+                    label=label,
+                )
+                self._choices[field] = entry.classes("oc-half").mark(name)
+            if form.haze == "measured":
+                self._entry(STRAYLIGHT, form.media_texts)
+        self._haze = ui.label("").classes("oc-hint oc-haze")
+        self.show_haze()
+
+    def show_haze(self) -> None:
+        """Say how much light the eye scatters, which depends on the age."""
+        self._haze.text = self.form.haze_text(age_years=self._age_years())
+        self._haze.set_visibility(bool(self._haze.text))
 
     def _correction(self) -> None:
         form, worn = self.form, self.form.worn

@@ -109,7 +109,9 @@ class EyesCard:
             with self._box:
                 form = self._state.form(name)
                 self._panels[name] = EyePanel(
-                    name, form, self._on_change, self._on_file
+                    *(name, form, self._on_change),
+                    age_years=lambda: self._state.values[number.name],
+                    on_file=self._on_file,
                 )
 
     def show_eye(self, name: EyeName) -> None:
@@ -179,6 +181,7 @@ class EyesCard:
         found = self._state.differences()
         paths = {one.path for one in found}
         for name, panel in self._panels.items():
+            panel.show_haze()
             panel.mark(paths if name in self._state.names else ())
         listed = "; ".join(f"{one.label}: {one.a} → {one.b}" for one in found)
         self._difference.text = (

@@ -92,6 +92,7 @@ class Header:
         with ui.element("header").classes("oc-header"):
             title("ocufilter", "h1", "oc-brand")
             ui.label("See through another person’s eyes").classes("oc-motto")
+            ui.label("Not a medical device").classes("oc-hint oc-not-medical")
             ui.element("span").classes("oc-grow")
             self._nav = ui.element("nav").classes("oc-downloads")
             self._nav.props("aria-label=Downloads")

@@ -173,8 +173,13 @@ class Page:
                 with ui.element("div").classes("oc-middle"):
                     self._picture_card()
                     self._sliders_card()
+                    with ui.element("div").classes("oc-told"):
+                        self.scenarios.build_text()
+                        self._note = ui.label("").classes("oc-note")
+                        self._note.props("aria-live=polite")
                     with ui.element("div").classes("oc-results"):
                         self.figures.build_figure()
+            self._show_views()
             ui.label(NOT_MEDICAL).classes("oc-hint oc-disclaimer")
 
     def _picture_card(self) -> None:
@@ -196,15 +201,10 @@ class Page:
                     props="size=sm",
                     kind="oc-arrangement",
                 )
-                with ui.element("div").classes("oc-told"):
-                    self._status = ui.label("").classes("oc-status")
-                    self._status.props("role=status aria-live=polite")
-                    self._note = ui.label("").classes("oc-note")
-                    self._note.props("aria-live=polite")
+                self._status = ui.label("").classes("oc-status")
+                self._status.props("role=status aria-live=polite")
                 help_button("the picture", PICTURE_HELP)
-            self.scenarios.build_text()
             self._scene_problem = problem_label()
-            self._show_views()
 
     def _sliders_card(self) -> None:
         with card("Viewing conditions", "oc-sliders"):
@@ -365,7 +365,7 @@ class Page:
             self.request()
 
     def _set_distance(self, meters: float) -> None:
-        self.state.move(DISTANCE.name, 1.0 / meters)
+        self.state.move(DISTANCE.name, round(1.0 / meters, 4))
         self._show_values()
         self.request()
 

@@ -51,9 +51,11 @@ export default {
                  :aria-valuetext="Math.round(split) + ' % ' + (left === 'scene' ? 'scene' : label(left))"
                  @keydown="onKey"><i></i></div>
           </div>
-          <template v-if="!isEmpty" v-for="name in left === 'scene' ? [eye] : [left, eye]">
-            <p v-if="captions[name]" class="oc-caption">{{ label(name) }}: {{ captions[name] }}</p>
-          </template>
+          <div v-if="!isEmpty" class="oc-captions">
+            <template v-for="name in left === 'scene' ? [eye] : [left, eye]">
+              <p v-if="captions[name]" class="oc-caption">{{ label(name) }}: {{ captions[name] }}</p>
+            </template>
+          </div>
         </div>
       </div>
       <div class="oc-view-tools">

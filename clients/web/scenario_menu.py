@@ -28,7 +28,9 @@ def start(state: PageState, scenario: Scenario) -> None:
         GAZE_H: gaze_h_deg,
         GAZE_V: gaze_v_deg,
     }
-    state.values |= {number.name: number.clamped(v) for number, v in values.items()}
+    state.values |= {
+        number.name: round(number.clamped(v), 4) for number, v in values.items()
+    }
     side = state.sides[0]
     for name, one in ((side, scenario.a), (B_OF[side], scenario.b)):
         state.load_body(name, one.profile, one.title)
