@@ -7,6 +7,7 @@ page           the page: layout and event handlers
 header         downloads, and the link in the browser's address
 page_state     state of a page, independent of the layout, and as text for links
 controls       the numbers that can be entered, with limits, steps, initial values
+written        those numbers as people write them
 comparison     states A and B of one person: names, differences, a joined picture
 eye_form       entries of an eye and its correction, and the resulting profile
 eye_panel      those entries on the page

@@ -13,7 +13,15 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from clients.web.controls import AGE, CONDITIONS, CORRECTION, PRESCRIPTION, NumberField
-from clients.web.eye_form import DESIGNS, KINDS, SIDES, EyeSide, preset_titles
+from clients.web.eye_form import (
+    DESIGNS,
+    HAZES,
+    KINDS,
+    SIDES,
+    YELLOWINGS,
+    EyeSide,
+    preset_titles,
+)
 from clients.web.picture import png_of
 
 EyeName = Literal["OD", "OS", "OD_B", "OS_B"]
@@ -35,8 +43,7 @@ _LABELS = {
     "correction": "Correction",
     "correction.kind": "Correction",
     "correction.design": "Design",
-    "straylight.log_s": "Straylight",
-    "straylight.cataract": "Cataract",
+    "straylight": "Straylight",
     "yellowing": "Yellowing of the lens",
 }
 _LABEL_HEIGHT_PX, _GAP_PX = 36, 8
@@ -101,11 +108,20 @@ def _flat(body: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     if "sphere_dpt" in body:
         found |= {f"{prefix}cylinder_dpt": 0.0, f"{prefix}axis_deg": 0.0}
     for name, value in body.items():
-        if isinstance(value, Mapping):
+        if name == "straylight":
+            found[name] = _haze_text(value)
+        elif isinstance(value, Mapping):
             found |= _flat(value, f"{prefix}{name}.")
         else:
             found[prefix + name] = value
     return found
+
+
+def _haze_text(straylight: Mapping[str, Any]) -> str:
+    if "log_s" in straylight:
+        return f"log s {straylight['log_s']:.2f}"
+    haze = straylight.get("cataract", "age")
+    return HAZES.get(haze, haze)
 
 
 def _correction_text(flat: Mapping[str, Any]) -> str:
@@ -141,7 +157,9 @@ def _text(path: str, flat: Mapping[str, Any]) -> str:
     if name in _FIELDS and isinstance(value, int | float):
         return _FIELDS[name].describe(value)
     known: Mapping[str, str] = {}
-    if path == "name":
+    if path == "yellowing":
+        known = dict(YELLOWINGS)  # type: ignore[arg-type]
+    elif path == "name":
         known = preset_titles()
     elif path.startswith(CORRECTION_PREFIX):
         known = dict(KINDS) | DESIGNS

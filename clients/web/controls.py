@@ -11,17 +11,12 @@ import re
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
+from clients.web.written import DEGREE, MINUS_SIGNS, written_number
+from clients.web.written import prescription_texts as prescription_texts
 from estimator.dynamics import steady_pupil_mm
 
-DEGREE = "°"
-MINUS_SIGNS = str.maketrans({"\N{MINUS SIGN}": "-", "\N{EN DASH}": "-", ",": "."})
-
-_POWER = r"([+-]?\d+(?:\.\d+)?)"
-_PRESCRIPTION = re.compile(
-    rf"{_POWER}\s*(?:[/;]\s*|\s+|(?=[+-])){_POWER}\s*"
-    r"(?:[x×*@/;]|ax(?:is|e)?\.?|\s)\s*(\d{1,3})\s*°?",
-    re.IGNORECASE | re.ASCII,
-)
+HIDDEN = 0.05
+"""Fraction of a number without decimals that is not shown."""
 
 
 METERS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "ft": 0.3048, "in": 0.0254}
@@ -70,7 +65,7 @@ class NumberField:
         return limits.replace("-", "\N{MINUS SIGN}")
 
     def read(self, text: str) -> float:
-        """Return the number in a text; a comma may be the decimal point.
+        """Return the number in a text as people write it; see `written_number`.
 
         Raises
         ------
@@ -81,10 +76,9 @@ class NumberField:
         shown = text.strip()
         if not shown:
             raise ValueError(f"{self.label} is empty; allowed: {self.allowed}")
-        try:
-            value = float(shown.translate(MINUS_SIGNS))
-        except ValueError:
-            value = math.nan
+        value = written_number(
+            shown, unit=self.unit, is_vertex=self.name == "vertex_mm"
+        )
         if not math.isfinite(value):
             raise ValueError(f"“{shown:.20}” is not a number; allowed: {self.allowed}")
         if not self.low <= value <= self.high:
@@ -124,7 +118,10 @@ class NumberField:
     def show(self, value: float) -> str:
         """Return a value as displayed in an entry."""
         sign = "+" if self.is_signed and value > 0 else ""
-        return f"{sign}{value:.{self.digits}f}"
+        digits = self.digits
+        if not digits and abs(value - round(value)) >= HIDDEN:
+            digits = 1  # 12.5 mm as typed
+        return f"{sign}{value:.{digits}f}"
 
     def normalized(self, text: str, steps: int = 0) -> str:
         """Return a valid text as displayed, "-4" as "-4.00"; others unchanged.
@@ -200,6 +197,18 @@ MIDDLE_ADD = NumberField(
     "middle_add_dpt", "Middle add", "dpt", 0.5, 6.0, 0.01, 1.66, is_signed=True
 )
 NEAR_ADD = replace(MIDDLE_ADD, name="near_add_dpt", label="Near add", initial=3.32)
+RESIDUAL_SPHERE = NumberField(
+    *("residual_sphere_dpt", "Residual sphere", "dpt", -10.0, 10.0, 0.25),
+    is_signed=True,
+)
+RESIDUAL_CYLINDER = replace(
+    RESIDUAL_SPHERE, name="residual_cylinder_dpt", label="Residual cylinder"
+)
+RESIDUAL_AXIS = replace(AXIS, name="residual_axis_deg", label="Residual axis")
+RESIDUAL = (RESIDUAL_SPHERE, RESIDUAL_CYLINDER, RESIDUAL_AXIS)
+"""Refraction that remains after surgery, at the cornea."""
+
+STRAYLIGHT = NumberField("log_s", "log s at 7°", "", 0.5, 2.5, 0.05, 1.2)
 ABERRATION = NumberField(
     *("spherical_aberration_um", "C(4,0), 6 mm", "µm", -2.0, 2.0, 0.01),
     is_signed=True,
@@ -207,6 +216,7 @@ ABERRATION = NumberField(
 CORRECTION = (
     *PRESCRIPTION,
     *(PROGRESSIVE_ADD, CORRIDOR, MIDDLE_ADD, NEAR_ADD, ABERRATION),
+    *RESIDUAL,
 )
 """All entries of corrections."""
 
@@ -240,12 +250,3 @@ def distance_text(vergence_dpt: float) -> str:
     meters = 1.0 / vergence_dpt
     distance = f"{100 * meters:.0f} cm" if meters < 1.0 else f"{meters:.1f} m"
     return f"{vergence_dpt:.2f} dpt · {distance}"
-
-
-def prescription_texts(text: str) -> tuple[str, str, str] | None:
-    """Return sphere, cylinder and axis of a text as "-3.5 -1.25 x 80".
-
-    None if the text has another form.
-    """
-    found = _PRESCRIPTION.fullmatch(text.strip().translate(MINUS_SIGNS))
-    return None if found is None else (found[1], found[2], found[3])
