@@ -15,16 +15,25 @@ image: the filter alone, without reading or writing files.
 
 Errors are the largest difference from the images of ``worker``, in steps of 8 bits, and
 for ``worker`` and ``one state`` the PSNR of the worst of some images against exact PSFs
-(``render_tolerance=0``).  `albumentations` and `kornia` blur the same image with a
-Gaussian if they are installed: one blur for all pixels and colors, of no eye.  Writes
-results/ml.json.
+(``render_tolerance=0``).
+
+``batch`` is `ocufilter batch --sample-eyes` with two processes: crops of photographs
+from JPEG files to PNG files with labels, an eye of 200 persons for each.  Its time is
+wall time for an image, with the start of the processes, and its error the PSNR of the
+worst of some images against ``--render-tolerance 0``.
+
+`albumentations` and `kornia` blur the same image with a Gaussian if they are installed:
+one blur for all pixels and colors, of no eye.  Writes results/ml.json.
 """
 
 from filter_service import one_blas_thread  # noqa: F401, I001  (before any numpy)
 
 import argparse
 import importlib.util
+import json
 import os
+import subprocess
+import sys
 import tempfile
 import time
 from collections.abc import Callable
@@ -33,6 +42,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from PIL import Image
 
 from estimator.threads import THREADS_VARIABLE
 from filter_service import Camera, EyeBank, EyeFilter, FilterSettings
@@ -45,6 +55,13 @@ MODES = ("dynamic", "on-axis")
 COUNT, QUICK_COUNT = 24, 3
 BANK_COUNT, QUICK_BANK_COUNT = 200, 3
 EXACT_COUNT, QUICK_EXACT_COUNT = 4, 1
+BATCH_COUNT, QUICK_BATCH_COUNT = 5000, 6
+PICTURES = (
+    *("astronaut.png", "coffee.png", "chelsea.png", "rocket.jpg"),
+    *("motorcycle_left.png", "hubble_deep_field.jpg", "retina.jpg", "ihc.png"),
+)
+"""Photographs of scikit-image, which its package contains."""
+
 CLOCK_HZ = os.sysconf("SC_CLK_TCK")
 
 
@@ -234,6 +251,71 @@ def run_mode(
     return runs.rows
 
 
+def write_crops(folder: Path, count: int) -> None:
+    """Write crops of photographs."""
+    import skimage
+
+    rng = np.random.default_rng(3)
+    place = Path(skimage.__file__).parent / "data"
+    pictures = [np.asarray(Image.open(place / n).convert("RGB")) for n in PICTURES]
+    folder.mkdir()
+    for number in range(count):
+        picture = pictures[number % len(pictures)]
+        y, x = (int(rng.integers(0, n - SIDE_PX + 1)) for n in picture.shape[:2])
+        crop = np.ascontiguousarray(picture[y : y + SIDE_PX, x : x + SIDE_PX])
+        Image.fromarray(crop).save(folder / f"{number:05d}.jpg", quality=95)
+
+
+def run_batch(
+    mode: str, folder: Path, counts: tuple[int, int, int], details: list[dict]
+) -> Row:
+    """Measure `ocufilter batch` with an eye for each image."""
+    count, people_count, exact_count = counts
+    crops = folder / "crops"
+    if not crops.exists():
+        write_crops(crops, count)
+    person = {"kind": "prescription", "sphere_dpt": -1.5, "age_years": 30}
+    common = [
+        *(sys.executable, "-m", "ocufilter", "batch", str(crops), "--json"),
+        *("-p", json.dumps(person), "--sample-eyes", str(people_count), "--seed", "1"),
+        *("--sample-pupil-mm", "{},{}".format(*PUPILS_MM)),
+        *("--sample-focus-dpt", "{},{}".format(*FOCI_DPT)),
+        *("--fov-deg", str(FOV_DEG), "--distance-m", str(DISTANCE_M)),
+        *("--settings", json.dumps({"mode": mode}), "--workers", "2"),
+    ]
+
+    def images(name: str, *more: str) -> tuple[dict[str, Any], list[np.ndarray]]:
+        out = folder / f"{name}_{mode}"
+        command = [*common, "-o", str(out), *more]
+        told = subprocess.run(command, check=True, stdout=subprocess.PIPE)
+        files = sorted(out.glob("images/*.png"))[:exact_count]
+        return json.loads(told.stdout), [np.asarray(Image.open(f)) for f in files]
+
+    start_s = time.perf_counter()
+    summary, found = images("seen")
+    took_s = time.perf_counter() - start_s
+    _, exact = images("exact", "--limit", str(exact_count), "--render-tolerance", "0")
+    core_s = summary["this_run"]["core_seconds"]
+    eyes = len(summary["frames_done"])
+    details.append(
+        {
+            "mode": mode,
+            "images": count,
+            "eyes": eyes,
+            "workers": 2,
+            "seconds": round(took_s, 1),
+            "core_ms": round(1e3 * core_s / count, 2),
+            "images_per_s": round(count / took_s, 1),
+        }
+    )
+    ms = 1e3 * took_s / count
+    error = worst_db(found, exact)
+    return Row(
+        *("ml", "batch", mode, f"{SIDE_PX}x{SIDE_PX}", count, ms, ms, memory_mb()),
+        *("PSNR, dB", error, "exact PSFs"),
+    )
+
+
 def blurs(count: int) -> list[dict]:
     """Return the times of Gaussian blurs of other packages, if they are installed."""
     color = scene_view("courtyard", width_px=SIDE_PX, height_px=SIDE_PX).color
@@ -267,19 +349,23 @@ def main() -> None:
     options = parser.parse_args()
     os.environ[THREADS_VARIABLE] = "1"
     counts = COUNT, BANK_COUNT, EXACT_COUNT
+    batch_counts = BATCH_COUNT, BANK_COUNT, EXACT_COUNT
     if options.quick:
         counts = QUICK_COUNT, QUICK_BANK_COUNT, QUICK_EXACT_COUNT
+        batch_counts = QUICK_BATCH_COUNT, QUICK_BANK_COUNT, QUICK_EXACT_COUNT
     rows: list[Row] = []
     details: list[dict] = []
+    batches: list[dict] = []
     with tempfile.TemporaryDirectory() as name:
         for mode in MODES:
             rows += run_mode(mode, counts, Path(name) / mode, details)
+            rows.append(run_batch(mode, Path(name), batch_counts, batches))
     publish(
         "ml",
         rows,
         as_json=options.json,
         is_whole=not options.quick,
-        details={"banks": details, "blurs": blurs(counts[0])},
+        details={"banks": details, "batches": batches, "blurs": blurs(counts[0])},
     )
 
 
