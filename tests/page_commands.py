@@ -214,6 +214,7 @@ def make_files(folder: Path) -> None:
     (folder / "photos").mkdir()
     for name in ("photo.jpg", "room.png", "photos/a.jpg"):
         color.save(folder / name)
+    (folder / "eyes.csv").write_text("image,profile,pupil_mm\n*,me.json,3\n")
     np.save(folder / "room.npy", np.asarray(millimeters, np.float32) / 1000)
     np.save(folder / "scene.npy", np.repeat(squares[..., None], 4, 2) / np.float32(255))
     for name, sphere_dpt in (("eye", -2), ("me", -1), ("before", -4), ("after", 0)):

@@ -91,6 +91,10 @@ CALIBRATION = (
     "cam0=[3997.684 0 1176.728; 0 3997.684 1011.728; 0 0 1]\n"
     "doffs=131.111\nbaseline=193.001\nwidth=2964\nheight=1988\nndisp=280\n"
 )
+EYES = """image,profile,pupil_mm,focus_dpt,distance_m,gaze_h_deg
+cats/*,myopia,3.5,center,1,2
+0007,"{""kind"": ""prescription"", ""sphere_dpt"": -3}",,0.5,inf,
+"""
 STATES = "frame,pupil_mm,focus_dpt\n" + "".join(
     f"{k:06d},{3 + k / 10},{k / 5}\n" for k in range(5)
 )
@@ -129,6 +133,7 @@ class Kind:
 def kinds(folder: Path) -> list[Kind]:
     """Return all kinds; valid files are written to a folder, and read from there."""
     from clients.batch.datasets import read_calibration, tum_frames
+    from clients.batch.eye_table import read_eyes
     from clients.batch.manifest import Manifest, ManifestDiffers
     from clients.batch.source import read_states
     from clients.batch.video_reading import VideoReader
@@ -228,6 +233,11 @@ def kinds(folder: Path) -> list[Kind]:
             {"s.csv": STATES.encode()},
             lambda path: read_states(path, [f"{k:06d}" for k in range(5)]),
             _states_command,
+        ),
+        Kind(
+            "eyes",
+            {"e.csv": EYES.encode()},
+            lambda path: read_eyes(path, named={}),
         ),
         Kind(
             "manifest",

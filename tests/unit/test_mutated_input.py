@@ -38,7 +38,16 @@ MAX_TRACED_MB = 100.0
 SCHEMA = "profile of the schema"
 FILES = (
     *("color", "depth", "npy", "OpenEXR", "photo", "profile", "display", "TUM list"),
-    *("calibration", "states", "manifest", "video", "glTF", "stored eye", "lens file"),
+    *(
+        "calibration",
+        "states",
+        "eyes",
+        "manifest",
+        "video",
+        "glTF",
+        "stored eye",
+        "lens file",
+    ),
     *("given eye", "configuration", "key", "link", "training set", "people"),
 )
 
