@@ -215,8 +215,13 @@ def color_frames(
     folder = _sub_folder(source, COLOR_FOLDERS) or source
     folders = [folder]
     if not images_in(folder, COLOR_SUFFIXES):
-        inner = [path for path in folder.rglob("*") if path.is_dir()]
-        folders = sorted(path for path in inner if not path.name.startswith("."))
+        folders = [
+            path
+            for path in sorted(folder.rglob("*"))
+            if path.is_dir()
+            and not path.name.startswith(".")
+            and path.name.lower() not in DEPTH_FOLDERS
+        ]
     found = []
     for place in folders:
         files = images_in(place, COLOR_SUFFIXES)

@@ -112,7 +112,7 @@ class Drawn:
             described |= {"profiles": profiles, "count": count, "first_person": first}
             return cls(number, eye, *ranges, described)
         try:
-            found = EyeBank(bank)
+            found = EyeBank(bank.absolute())  # for workers elsewhere
         except FileNotFoundError:
             raise ValueError(
                 f"--bank '{bank}': no bank; allowed: a folder of `ocufilter bank`"

@@ -54,6 +54,8 @@ def classes(tmp_path_factory):
         place.mkdir(exist_ok=True)
         color = rng.integers(0, 256, (SIDE_PX, SIDE_PX, 3), dtype=np.uint8)
         Image.fromarray(color).save(place / f"{number}.png")
+    (folder / "dogs/depth").mkdir()
+    Image.fromarray(color[..., 0]).save(folder / "dogs/depth/0.png")
     return folder
 
 
@@ -304,7 +306,7 @@ def test_options_that_do_not_fit_are_refused(classes, tmp_path, capsys, more, wo
 
 def test_a_table_of_states_may_have_profiles(classes, tmp_path):
     names = sorted(
-        p.relative_to(classes).with_suffix("") for p in classes.rglob("*.png")
+        p.relative_to(classes).with_suffix("") for p in classes.glob("*/*.png")
     )
     lines = [f"{name},{'me' if k else 'myopia'},3" for k, name in enumerate(names)]
     states = table(tmp_path, "\n".join(["frame,profile,pupil_mm", *lines]))
@@ -375,7 +377,7 @@ def test_labels_tell_of_each_image_and_its_eye(classes, sampled):
     rows = labels_of(sampled)
     assert len(rows) == COUNT
     assert {row["source"] for row in rows} == {
-        path.relative_to(classes).as_posix() for path in classes.rglob("*.png")
+        path.relative_to(classes).as_posix() for path in classes.glob("*/*.png")
     }
     assert (sampled / "labels.csv").stat().st_mode & 0o077 == 0
     for row in rows:
