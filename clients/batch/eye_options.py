@@ -14,7 +14,7 @@ from clients.batch.eye_table import (
     settings_of_rows,
     with_rows,
 )
-from clients.batch.eyes import SYNTEYES, Drawn
+from clients.batch.eyes import SYNTEYES, Drawn, checked_settings
 from clients.batch.options import BatchOptions
 from clients.batch.profiles import check_last_person, read_profiles
 from clients.batch.source import SourceFrame, States
@@ -108,7 +108,7 @@ def with_own_eyes(
             frames,
             rows,
             usual,
-            gaze_deg=settings.gaze_deg,
+            gaze_deg=checked_settings(given).gaze_deg,
             path=path,
             source=options.source,
             option="states" if options.eyes is None else "eyes",

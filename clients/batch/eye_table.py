@@ -16,7 +16,7 @@ from fnmatch import translate
 from pathlib import Path
 from typing import Any
 
-from clients.batch.eyes import NamedEye, narrow_settings
+from clients.batch.eyes import NamedEye, checked_settings, narrow_settings
 from clients.batch.source import (
     CENTER,
     CENTER_RANGE_DPT,
@@ -57,6 +57,9 @@ COLUMNS = ("image", "profile", *LIMITS)
 MAX_GLOBS = 1000
 """Globs in a table, each of which is compared with the names of all images."""
 
+MAX_DIGITS = 20
+"""Digits of the number of a frame."""
+
 _GLOB = re.compile(r"[*?\[]")
 
 
@@ -84,8 +87,8 @@ class EyeRow:
 
 def is_table_of_eyes(path: Path) -> bool:
     """Return whether a table of states has a column of profiles."""
-    header = read_text(path, option="states").split("\n", 1)[0]
-    return "profile" in [cell.strip() for cell in header.split(",")]
+    header = read_text(path, option="states").partition("\n")[0]
+    return "profile" in [cell.strip(' "\r') for cell in header.split(",")]
 
 
 def read_eyes(
@@ -234,22 +237,21 @@ def with_rows(
         If a row has no image, an image has no row, or one has two.
     """
     by_name = _by_name(frames, source)
-    place_of: dict[str, EyeRow] = {}
+    row_of: dict[str, EyeRow] = {}
     for row, names in _matches(rows, by_name, path, option):
         for name in names:
-            other = place_of.setdefault(name, row)
+            other = row_of.setdefault(name, row)
             if other is not row:
                 found = f"line {row.line}: '{row.image:.60}' matches '{name}', as line "
                 allowed = "one row per image"
                 raise InvalidFile(path, f"{found}{other.line} does", allowed, option)
-    lacking = [frame.name for frame in frames if frame.name not in place_of]
+    lacking = [frame.name for frame in frames if frame.name not in row_of]
     if lacking:
         found = f"no line for '{lacking[0]}' ({len(lacking)} of {len(frames)} images)"
         raise InvalidFile(path, found, "a row for each image", option)
     usual_gaze_deg = gaze_deg if any(map(_has_gaze, rows)) else None
     return [
-        _with_row(frame, place_of[frame.name], usual, usual_gaze_deg)
-        for frame in frames
+        _with_row(frame, row_of[frame.name], usual, usual_gaze_deg) for frame in frames
     ]
 
 
@@ -257,7 +259,7 @@ def _by_name(frames: Sequence[SourceFrame], source: Path) -> dict[str, str]:
     """Return the names of frames by the texts that may stand for them in a table."""
     found: dict[str, str] = {}
     for frame in frames:
-        if frame.name.isdecimal():
+        if frame.name.isdecimal() and len(frame.name) < MAX_DIGITS:
             found[str(int(frame.name))] = frame.name
         if frame.color_index is None and frame.color.is_relative_to(source):
             path = frame.color.relative_to(source).as_posix()
@@ -272,6 +274,8 @@ def _matches(
     n_globs = 0
     for row in rows:
         text = same_text(row.image.strip())
+        if text not in by_name and text.isdecimal() and len(text) < MAX_DIGITS:
+            text = str(int(text))
         names = [by_name[text]] if text in by_name else []
         if not names and option == "eyes" and _GLOB.search(text):
             n_globs += 1
@@ -352,7 +356,7 @@ def settings_of_rows(
         known_dpt += objects_dpt or CENTER_RANGE_DPT
     gazes_deg = []
     if any(map(_has_gaze, rows)):
-        usual_deg = given.get("gaze_deg", (0.0, 0.0))
+        usual_deg = checked_settings(given).gaze_deg
         gazes_deg = [_gaze_deg(row, usual_deg) for row in rows]
     return narrow_settings(given, pupils_mm, known_dpt, objects_dpt, gazes_deg)
 

@@ -255,7 +255,18 @@ def narrow_settings(
         low, high = np.min(gazes_deg, axis=0), np.max(gazes_deg, axis=0)
         gazes["gaze_deg"] = (0.5 * (low + high)).tolist()
         gazes["gaze_range_deg"] = (0.5 * (high - low)).tolist()
+    return checked_settings({**ranges, **given, **gazes})
+
+
+def checked_settings(given: Mapping[str, Any]) -> FilterSettings:
+    """Return settings from the fields of ``--settings``.
+
+    Raises
+    ------
+    ValueError
+        If a setting is unknown or out of range.
+    """
     try:
-        return FilterSettings(**{**ranges, **given, **gazes})
+        return FilterSettings(**given)
     except TypeError as error:
         raise ValueError(f"--settings: {error}") from None

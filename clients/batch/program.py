@@ -155,7 +155,7 @@ def failure_lines(summary: dict[str, Any]) -> list[str]:
 
 @with_options
 def batch(options: BatchOptions, json_output: Json = False) -> None:
-    """Filter folders and videos of color and depth on all cores, through each profile.
+    """Filter folders and videos on all cores, through profiles or an eye per image.
 
     Run the same command again to continue an interrupted batch.
 
@@ -165,6 +165,8 @@ def batch(options: BatchOptions, json_output: Json = False) -> None:
 
     ocufilter batch walk.mp4 --depth walk_depth.mkv --fov-deg 60 -p myopia
     --format h264 -o walk_seen
+
+    ocufilter batch photos/ --sample-eyes 9 --fov-deg 20 --distance-m 2 -o persons
 
     \b
     Layouts, detected from the content of the folder:
@@ -181,8 +183,9 @@ def batch(options: BatchOptions, json_output: Json = False) -> None:
                   of images
 
     Results are OUT/PROFILE/FRAME.png or OUT/PROFILE.mkv, with a line for each frame in
-    OUT/manifest.jsonl and a summary in OUT/manifest.json.  The exit code is 1 if some
-    frames failed.
+    OUT/manifest.jsonl and a summary in OUT/manifest.json.  If each image has an eye of
+    its own, by --eyes, --sample-eyes or --bank, they are OUT/images/FRAME.png, with
+    labels in OUT/labels.csv.  The exit code is 1 if some frames failed.
     """  # noqa: D301  (\b keeps the lines of the list)
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:

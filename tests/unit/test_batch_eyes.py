@@ -317,6 +317,30 @@ def test_a_table_of_states_may_have_profiles(classes, tmp_path):
     assert batch.job.settings.pupil_range_mm == (3.0, 3.0)
 
 
+def test_rows_without_a_gaze_look_ahead(classes, tmp_path):
+    path = table(tmp_path, "image,gaze_h_deg\ncats/*,8\ndogs/*,\n")
+    batch = batch_of(
+        options_of(
+            classes, tmp_path / "out", profile=[PERSON], eyes=path, settings="{}"
+        )
+    )
+    gazes = {frame.name[:4]: frame.eye.gaze_deg for frame in batch.frames}
+    assert gazes == {"cats": (8.0, 0.0), "dogs": (0.0, 0.0)}
+    settings = batch.job.settings
+    assert (settings.gaze_deg, settings.gaze_range_deg) == ((4.0, 0.0), (4.0, 0.0))
+
+
+def test_distances_of_a_table_need_no_option(classes, tmp_path):
+    path = table(tmp_path, "image,distance_m\ncats/*,1\ndogs/*,inf\n")
+    given = {"profile": [PERSON], "eyes": path, "focus_dpt": "center"}
+    batch = batch_of(options_of(classes, tmp_path / "out", distance_m=None, **given))
+    found = {(f.name[:4], f.depth_form.distance_dpt) for f in batch.frames}
+    assert found == {("cats", 1.0), ("dogs", 0.0)}
+    assert {f.eye.states.focus_dpt for f in batch.frames} == {1.0, 0.0}
+    assert batch.job.settings.object_planes_dpt == (0.0, 1.0)
+    assert batch.job.settings.focus_range_dpt == (0.0, 1.0)
+
+
 # Results
 
 
