@@ -14,12 +14,12 @@ from clients.batch.eye_table import (
     settings_of_rows,
     with_rows,
 )
-from clients.batch.eyes import SYNTEYES, Drawn, checked_settings
+from clients.batch.eyes import SYNTEYES, Drawn
 from clients.batch.options import BatchOptions
 from clients.batch.profiles import check_last_person, read_profiles
 from clients.batch.source import SourceFrame, States
 from clients.batch.views import Views
-from clients.batch.work import FORMATS, VIDEO_FORMATS
+from clients.batch.work import FORMATS, VIDEO_FORMATS, checked_settings
 from clients.commands.options import read_object
 from clients.commands.state_options import listed_numbers
 from filter_service import FilterSettings

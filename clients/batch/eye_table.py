@@ -16,7 +16,7 @@ from fnmatch import translate
 from pathlib import Path
 from typing import Any
 
-from clients.batch.eyes import NamedEye, checked_settings, narrow_settings
+from clients.batch.eyes import NamedEye, narrow_settings
 from clients.batch.source import (
     CENTER,
     CENTER_RANGE_DPT,
@@ -28,6 +28,7 @@ from clients.batch.source import (
     same_text,
 )
 from clients.batch.views import DISTANCE_LIMITS_M
+from clients.batch.work import checked_settings
 from clients.provenance import fingerprint, folder_name, profile_name
 from estimator import (
     InvalidFile,

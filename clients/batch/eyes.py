@@ -23,6 +23,7 @@ from clients.batch.source import (
     States,
     same_text,
 )
+from clients.batch.work import checked_settings
 from estimator import (
     EyeProfile,
     drawn_profiles,
@@ -256,17 +257,3 @@ def narrow_settings(
         gazes["gaze_deg"] = (0.5 * (low + high)).tolist()
         gazes["gaze_range_deg"] = (0.5 * (high - low)).tolist()
     return checked_settings({**ranges, **given, **gazes})
-
-
-def checked_settings(given: Mapping[str, Any]) -> FilterSettings:
-    """Return settings from the fields of ``--settings``.
-
-    Raises
-    ------
-    ValueError
-        If a setting is unknown or out of range.
-    """
-    try:
-        return FilterSettings(**given)
-    except TypeError as error:
-        raise ValueError(f"--settings: {error}") from None

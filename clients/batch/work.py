@@ -134,6 +134,20 @@ class Job:
         }
 
 
+def checked_settings(given: Mapping[str, Any]) -> FilterSettings:
+    """Return settings from the fields of ``--settings``.
+
+    Raises
+    ------
+    ValueError
+        If a setting is unknown or out of range.
+    """
+    try:
+        return FilterSettings(**given)
+    except TypeError as error:
+        raise ValueError(f"--settings: {error}") from None
+
+
 def batch_settings(
     given: Mapping[str, Any], states: States, distances_dpt: Sequence[float] = ()
 ) -> FilterSettings:
@@ -154,11 +168,7 @@ def batch_settings(
     ValueError
         If a setting is unknown or out of range.
     """
-    try:
-        settings = FilterSettings(**given)
-    except TypeError as error:
-        raise ValueError(f"--settings: {error}") from None
-    settings = settings.covering(
+    settings = checked_settings(given).covering(
         pupils_mm=() if "pupil_range_mm" in given else states.pupil_range_mm,
         foci_dpt=() if "focus_range_dpt" in given else states.focus_range_dpt,
     )
