@@ -435,6 +435,21 @@ def test_refraction_in_labels_is_the_prescription(classes, tmp_path):
         np.testing.assert_allclose(found, [-2.5, *j], atol=0.02)
 
 
+@pytest.mark.long("builds two eyes twice")
+def test_only_images_whose_rows_have_changed_are_filtered_again(classes, tmp_path):
+    path, out = tmp_path / "eyes.csv", tmp_path / "out"
+    counts, labels = [], []
+    for name, sphere_dpt in (("me", -1), ("myopia", -1), ("myopia", -1), ("me", -2)):
+        person = json.dumps(json.loads(PERSON) | {"sphere_dpt": sphere_dpt})
+        path.write_text(f"image,profile\ncats/*,me\ndogs/0,{name}\ndogs/[24],me\n")
+        batch = batch_of(options_of(classes, out, profile=[person], eyes=path))
+        counts.append(finished(batch)["this_run"]["frames"])
+        labels.append({row["source"]: row["eye"] for row in labels_of(out)})
+    assert counts == [6, 1, 0, 6]
+    assert labels[1] == labels[0] | {"dogs/0.png": "myopia"}
+    assert labels[3] == labels[0]
+
+
 # The estimate of time
 
 
