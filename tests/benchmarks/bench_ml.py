@@ -19,7 +19,8 @@ for ``worker`` and ``one state`` the PSNR of the worst of some images against ex
 
 ``batch`` is `ocufilter batch --sample-eyes` with two processes: crops of photographs
 from JPEG files to PNG files with labels, an eye of 200 persons for each.  Its time is
-wall time for an image, with the start of the processes, and its error the PSNR of the
+wall time for an image, with the start of the processes, beside processor time without
+it and the load of the machine before and after.  Its error is the PSNR of the
 worst of some images against ``--render-tolerance 0``.
 
 `albumentations` and `kornia` blur the same image with a Gaussian if they are installed:
@@ -291,7 +292,7 @@ def run_batch(
         files = sorted(out.glob("images/*.png"))[:exact_count]
         return json.loads(told.stdout), [np.asarray(Image.open(f)) for f in files]
 
-    start_s = time.perf_counter()
+    load, start_s = os.getloadavg()[0], time.perf_counter()
     summary, found = images("seen")
     took_s = time.perf_counter() - start_s
     _, exact = images("exact", "--limit", str(exact_count), "--render-tolerance", "0")
@@ -306,6 +307,7 @@ def run_batch(
             "seconds": round(took_s, 1),
             "core_ms": round(1e3 * core_s / count, 2),
             "images_per_s": round(count / took_s, 1),
+            "load": [round(one, 1) for one in (load, os.getloadavg()[0])],
         }
     )
     ms = 1e3 * took_s / count
