@@ -24,13 +24,18 @@ it and the load of the machine before and after.  Its error is the PSNR of the
 worst of some images against ``--render-tolerance 0``.
 
 `albumentations` and `kornia` blur the same image with a Gaussian if they are installed:
-one blur for all pixels and colors, of no eye.  Writes results/ml.json.
+one blur for all pixels and colors, of no eye.
+
+Last, four processes filter as the workers of a data loader do, with the defaults of
+threads and builders: see `loader_workers`.  "none" returns the picture as it is, and is
+what the workers take without a filter.  Writes results/ml.json.
 """
 
 from filter_service import one_blas_thread  # noqa: F401, I001  (before any numpy)
 
 import argparse
 import importlib.util
+import itertools
 import json
 import os
 import subprocess
@@ -48,6 +53,7 @@ from PIL import Image
 from estimator.threads import THREADS_VARIABLE
 from filter_service import Camera, EyeBank, EyeFilter, FilterSettings
 from tests.benchmarks.harness import Row, memory_mb, publish, time_calls
+from tests.benchmarks.loader_workers import SeenPictures, digest, measured
 from tests.numerical.scene_frames import scene_view
 
 SIDE_PX, FOV_DEG, DISTANCE_M = 256, 20.0, 2.0
@@ -63,6 +69,7 @@ PICTURES = (
 )
 """Photographs of scikit-image, which its package contains."""
 
+N_WORKERS, QUICK_N_WORKERS = 4, 1
 CLOCK_HZ = os.sysconf("SC_CLK_TCK")
 
 
@@ -343,6 +350,33 @@ def blurs(count: int) -> list[dict]:
     return found
 
 
+def loaders(bank: EyeBank, count: int, n_workers: int) -> list[dict]:
+    """Return memory, start and speed of workers, and whether images are the same."""
+    runs = Runs(MODES[0], bank.camera)
+    eyes = {"bank": bank[:count], "drawn": people(count), "none": []}
+    expected, _ = runs.images(bank[:count])
+    wanted = {"none": digest([runs.frame[0]] * count)}
+    packages = [
+        "multiprocessing",
+        *["torch"][: bool(importlib.util.find_spec("torch"))],
+    ]
+    found = []
+    for package, (name, profiles), method in itertools.product(
+        packages, eyes.items(), ("fork", "spawn")
+    ):
+        pictures = SeenPictures(
+            runs.frame, bank.camera, bank.settings, profiles, states(count)
+        )
+        own = measured(pictures, method, n_workers, with_torch=package == "torch")
+        is_same = own.pop("images") == wanted.get(name, digest(expected))
+        found.append(
+            {"package": package, "eyes": name, "start": method}
+            | own
+            | {"same_images": is_same}
+        )
+    return found
+
+
 def main() -> None:
     """Run from the command line."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
@@ -350,9 +384,10 @@ def main() -> None:
     parser.add_argument("--json", action="store_true", help="print the report alone")
     options = parser.parse_args()
     os.environ[THREADS_VARIABLE] = "1"
-    counts = COUNT, BANK_COUNT, EXACT_COUNT
+    counts, n_workers = (COUNT, BANK_COUNT, EXACT_COUNT), N_WORKERS
     batch_counts = BATCH_COUNT, BANK_COUNT, EXACT_COUNT
     if options.quick:
+        n_workers = QUICK_N_WORKERS
         counts = QUICK_COUNT, QUICK_BANK_COUNT, QUICK_EXACT_COUNT
         batch_counts = QUICK_BATCH_COUNT, QUICK_BANK_COUNT, QUICK_EXACT_COUNT
     rows: list[Row] = []
@@ -362,12 +397,18 @@ def main() -> None:
         for mode in MODES:
             rows += run_mode(mode, counts, Path(name) / mode, details)
             rows.append(run_batch(mode, Path(name), batch_counts, batches))
+        workers = loaders(EyeBank(Path(name) / MODES[0]), counts[0], n_workers)
     publish(
         "ml",
         rows,
         as_json=options.json,
         is_whole=not options.quick,
-        details={"banks": details, "batches": batches, "blurs": blurs(counts[0])},
+        details={
+            "banks": details,
+            "batches": batches,
+            "workers": workers,
+            "blurs": blurs(counts[0]),
+        },
     )
 
 

@@ -20,6 +20,7 @@ from filter_service import (
     image_derivatives,
 )
 from ocufilter.torch import SeeThrough
+from tests.benchmarks.loader_workers import SeenPictures, digest, loaded_by_torch
 from tests.source_tree import ROOT
 
 SETTINGS = FilterSettings(mode="on-axis", eye_model="wavefront")
@@ -353,6 +354,16 @@ def test_workers_return_the_same(see, method):
     wanted = torch.stack(list(pictures))  # the filter is open before workers start
     loader = DataLoader(pictures, 2, num_workers=2, multiprocessing_context=method)
     assert torch.equal(torch.cat(list(loader)), wanted)
+
+
+@pytest.mark.parametrize("n_workers", [1, 2])
+def test_workers_return_the_images_of_a_filter(n_workers):
+    color = np.random.default_rng(3).integers(0, 256, (HEIGHT, WIDTH, 3), np.uint8)
+    states = [STATE, STATE | {"pupil_diameter_mm": 3.0}] * 4
+    pictures = SeenPictures((color, DEPTH_M), CAMERA, SETTINGS, EYES * 4, states)
+    found = loaded_by_torch(pictures, "fork", n_workers)
+    assert found["images"] == digest([pictures[number][1] for number in range(8)])
+    assert found["processes"] == found["workers"] == n_workers
 
 
 def test_other_shapes_and_types_raise(see):
