@@ -59,8 +59,8 @@ class ParentExited(Exception):
 
 
 def main() -> None:
-    """Run the worker; arguments are DESCRIPTOR BUILD NICENESS."""
-    descriptor, build_name, niceness = sys.argv[1:]
+    """Run the worker; arguments are BUILD NICENESS DESCRIPTOR."""
+    build_name, niceness, descriptor = sys.argv[1:]
     os.nice(int(niceness))
     serve_builds(Connection(int(descriptor)), build_name)
 
@@ -102,6 +102,8 @@ def serve_builds(pipe: Connection, build_name: str) -> None:
                 found, job = built[ticket]
                 job = replace(job, near=arguments[0])
                 parts = _parts_ahead(found, ticket, job)
+            elif kind == "forget":  # the next messages are of another builder
+                built, parts = {}, iter(())
     except (EOFError, OSError, ParentExited):
         return
 

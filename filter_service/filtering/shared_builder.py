@@ -25,6 +25,10 @@ if TYPE_CHECKING:
 
 GL_CONTEXTS = ("own", "current")
 
+KEEP_S = 10.0
+"""Time for which the worker process stays after the last filter was closed, for
+programs that open a filter for each eye in turn."""
+
 log = logging.getLogger("ocufilter")
 
 
@@ -200,7 +204,7 @@ class SharedBuilder:
         """Return the builder and add a reference; the first reference opens it."""
         if self._builder is None:
             limits = BuildLimits(store_cache_dir=default_cache_dir())
-            worker = WorkerHandle() if self._has_worker else InlineWorker()
+            worker = WorkerHandle(keep_s=KEEP_S) if self._has_worker else InlineWorker()
             with ExitStack() as closing:
                 self._builder = open_builder(
                     *(worker, limits, closing), engine=self._engine, current=current

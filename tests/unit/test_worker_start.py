@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from filter_service.building import worker_handle
 from filter_service.building.jobs import (
     BuildDone,
     BuildError,
@@ -33,14 +34,22 @@ def build(job, *, progress, cancelled):
 
 
 @contextmanager
-def started():
+def started(**options):
     """Start a worker whose builds report three stages."""
-    worker = WorkerHandle(f"{__name__}:build")
+    worker = WorkerHandle(f"{__name__}:build", **options)
     worker.start()
     try:
         yield worker
     finally:
         worker.close()
+
+
+def until(is_so):
+    """Wait until a condition is true."""
+    deadline_s = time.monotonic() + 20.0
+    while not is_so():
+        assert time.monotonic() < deadline_s
+        time.sleep(0.01)
 
 
 def events_until(worker, is_so):
@@ -125,3 +134,40 @@ def test_the_pipe_to_a_new_process_has_another_descriptor():
         events_until(worker, lambda _: worker.n_restarts)
         assert worker.file_descriptor not in (None, before)
         assert reports_of_build(worker)
+
+
+@pytest.mark.long("processes start")
+def test_the_process_of_a_closed_handle_is_kept_for_the_next_one(monkeypatch):
+    def pid_of(keep_s):
+        with started(keep_s=keep_s) as worker:
+            assert reports_of_build(worker)
+            assert worker.n_restarts == 0
+            return worker._worker.process.pid
+
+    first = pid_of(60.0)
+    assert pid_of(60.0) == first  # and reports of its second build
+    assert pid_of(0.0) != first
+    kept = worker_handle._kept._worker.process
+    assert (kept.pid, kept.poll()) == (first, None)
+    monkeypatch.setenv("OCUFILTER_CACHE_DIR", "/another")
+    assert pid_of(0.01) != first  # for another environment
+    assert kept.poll() is not None
+    until(lambda: worker_handle._kept._worker is None)  # its time is over
+
+
+@pytest.mark.long("a process starts")
+def test_a_process_that_is_busy_or_was_killed_is_not_kept():
+    with started(keep_s=60.0) as worker:
+        events_until(worker, lambda events: worker._is_ready)
+        worker.submit(JOB)  # it has not ended when the handle closes
+        process = worker._worker.process
+    assert process.poll() is not None
+    with started(keep_s=60.0) as worker:
+        events_until(worker, lambda events: worker._is_ready)
+        process = worker._worker.process
+    process.kill()
+    process.wait()
+    with started(keep_s=60.0) as worker:
+        assert worker._worker.process is not process
+        assert reports_of_build(worker)
+    worker_handle._kept.end()
