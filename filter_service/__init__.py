@@ -4,7 +4,7 @@
 Importing this package loads no submodules, which keeps clients light.
 
     settings         definition of every setting of a filter
-    displays         wavelengths of red, green and blue
+    displays         wavelengths and spectra of red, green and blue
     camera           pinhole camera, and which cameras share PSFs
     rgbd_view        color, depth and camera of one view
     texture_view     the same in textures of the caller

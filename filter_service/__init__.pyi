@@ -12,6 +12,8 @@ from .correcting.sensitivity import SensitivityWeight as SensitivityWeight
 from .correcting.solver import PictureOperator as PictureOperator
 from .correcting.solver import PictureSolution as PictureSolution
 from .correcting.solver import nearest_picture as nearest_picture
+from .displays import DisplaySpectra as DisplaySpectra
+from .displays import display_spectra as display_spectra
 from .errors import BadMessage as BadMessage
 from .errors import FilterError as FilterError
 from .filter_protocol import Filter as Filter

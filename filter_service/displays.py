@@ -1,4 +1,6 @@
-"""Wavelengths of a display's red, green and blue: one or two for each primary.
+"""Wavelengths and spectra of a display's red, green and blue.
+
+Frames have one or two wavelengths for each primary.
 
 The eye blurs each wavelength differently.  A primary's PSF is computed for the
 single wavelength that best represents its spectrum, weighted by the color-matching
@@ -13,7 +15,8 @@ encoded with "common" and 51.2 to 53.4 with a display's own
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from filter_service.errors import BadMessage
 
@@ -40,6 +43,14 @@ WIDTHS_NM = {
 }
 """Standard deviations of the spectra of red, green and blue, nm."""
 
+MEASURED = {
+    "common": "LCD, white LEDs (Apple)",
+    "lcd": "LCD, white LEDs (Apple)",
+    "oled": "OLED (Sony)",
+    "crt": "CRT (Dell)",
+}
+"""Displays of `display_spectra.json` whose spectra stand for these names."""
+
 LIMITS_NM = (380.0, 780.0)
 MAX_WIDTH_NM = 40.0
 ALLOWED = (
@@ -49,6 +60,71 @@ ALLOWED = (
 )
 
 Triple = tuple[float, float, float]
+
+
+class DisplaySpectra(NamedTuple):
+    """Spectra of a display's primaries.
+
+    Attributes
+    ----------
+    wavelengths_nm : (n,)
+        Ascending.
+    spectra : (n, 3)
+        Power of red, green and blue at each wavelength.
+    """
+
+    wavelengths_nm: NDArray[np.float64]
+    spectra: NDArray[np.float64]
+
+    @property
+    def scaled_to_white(self) -> DisplaySpectra:
+        """The same display, scaled so that Y of its white is 1 (CIE 1931)."""
+        from estimator.color import xyz_weights
+
+        y = self.spectra.sum(axis=1) @ xyz_weights(self.wavelengths_nm)[:, 1]
+        return self._replace(spectra=self.spectra / y)
+
+
+def display_spectra(display: str = "common") -> DisplaySpectra:
+    """Return the measured spectra of a display, every 10 nm from 400 to 700 nm.
+
+    They convert linear RGB to cone signals or CIE XYZ: ``rgb @ (spectra.T @
+    lms_weights(wavelengths_nm))``.
+
+    Parameters
+    ----------
+    display : "common", "lcd", "oled" or "crt"
+        The first two are an LCD with white LEDs.
+
+    Returns
+    -------
+    DisplaySpectra
+        Scaled so that Y of white is 1 (CIE 1931).
+
+    Raises
+    ------
+    BadMessage
+        If there are no spectra of this name.
+
+    References
+    ----------
+    Displays of Apple, Sony and Dell as measured for isetbio.
+    """
+    import json
+
+    import numpy as np
+
+    if display not in MEASURED:
+        raise BadMessage(
+            f"no spectra of {display!r:.60} are known",
+            field="display",
+            allowed=", ".join(MEASURED),
+        )
+    path = Path(__file__).with_name("display_spectra.json")
+    content = json.loads(path.read_text(encoding="utf-8"))
+    at_nm = np.array(content["wavelengths_nm"], dtype=np.float64)
+    power = np.array(content["displays"][MEASURED[display]])
+    return DisplaySpectra(at_nm, power).scaled_to_white
 
 
 def display_wavelengths_nm(display: str) -> Triple:

@@ -84,6 +84,7 @@ from filter_service import Camera as Camera
 from filter_service import ColorImage as ColorImage
 from filter_service import Correction as Correction
 from filter_service import DepthProjection as DepthProjection
+from filter_service import DisplaySpectra as DisplaySpectra
 from filter_service import EyeBank as EyeBank
 from filter_service import EyeFailed as EyeFailed
 from filter_service import EyeFilter as EyeFilter
@@ -110,6 +111,7 @@ from filter_service import ViewState as ViewState
 from filter_service import as_views as as_views
 from filter_service import best_lens as best_lens
 from filter_service import correct as correct
+from filter_service import display_spectra as display_spectra
 from filter_service import errors as errors
 from filter_service import image_derivatives as image_derivatives
 from filter_service import is_software_renderer as is_software_renderer

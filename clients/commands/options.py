@@ -19,7 +19,7 @@ import numpy as np
 import typer
 
 from estimator.bounded_files import InvalidFile, loads_bounded, printable, read_text
-from filter_service.displays import primaries_of_spectra
+from filter_service.displays import DisplaySpectra, primaries_of_spectra
 from filter_service.errors import BadMessage
 from filter_service.settings import DEFAULTS, setting_help, setting_types
 from filter_service.validation import checked
@@ -272,15 +272,51 @@ def display_of_file(name: str) -> str:
     Parameters
     ----------
     name : str
-        Path of a .csv file with the columns wavelength in nm, red, green and blue.  A
-        header line is skipped; wavelengths must be evenly spaced.
+        Path of a file for `read_spectra`.
 
     Raises
     ------
     InvalidFile
         If the file is invalid.  The message names the file and the problem.
     """
-    text = read_text(Path(name), max_bytes=MAX_DISPLAY_BYTES, option="display")
+    return display_of_spectra(name, read_spectra(name), option="display")
+
+
+def display_of_spectra(name: str, spectra: DisplaySpectra, *, option: str) -> str:
+    """Return the setting `display` for the spectra of a file, whose name errors have.
+
+    Raises
+    ------
+    InvalidFile
+        If the spectra are not three independent colors.
+    """
+    try:
+        with np.errstate(all="ignore"):  # primaries_of_spectra rejects zeros
+            primaries = primaries_of_spectra(*spectra)
+    except ValueError as error:
+        _refuse(name, str(error), "measured spectra of three primaries", option)
+    return ",".join(
+        f"{nm:.1f}:{width_nm:.1f}" for nm, width_nm in zip(*primaries, strict=True)
+    )
+
+
+def read_spectra(name: str, *, option: str = "display") -> DisplaySpectra:
+    """Return the spectra of a display in a file.
+
+    Parameters
+    ----------
+    name : str
+        Path of a .csv file with the columns wavelength in nm, red, green and blue.  A
+        header line is skipped; wavelengths must be evenly spaced.
+    option : str
+        Name of the command-line option, for errors.
+
+    Raises
+    ------
+    InvalidFile
+        If the file is invalid.  The message names the file and the problem.
+    """
+    text = read_text(Path(name), max_bytes=MAX_DISPLAY_BYTES, option=option)
     lines = text.split("\n")
     try:
         table = np.array(
@@ -290,26 +326,19 @@ def display_of_file(name: str) -> str:
                 if line.strip() and not (number == 0 and _is_header(line))
             ]
         )
-        columns = table[:, 0], table[:, 1:]
+        found = DisplaySpectra(table[:, 0], table[:, 1:])
     except (ValueError, IndexError):
-        _refuse(name, "a line without four numbers", "nm, red, green, blue")
+        _refuse(name, "a line without four numbers", "nm, red, green, blue", option)
     if not np.abs(table).max() <= MAX_VALUE:
-        _refuse(name, "a number is too large", f"at most {MAX_VALUE:g}")
-    steps_nm = np.diff(columns[0])
+        _refuse(name, "a number is too large", f"at most {MAX_VALUE:g}", option)
+    steps_nm = np.diff(found.wavelengths_nm)
     if not (steps_nm.size and np.allclose(steps_nm, steps_nm[0]) and steps_nm[0] > 0):
-        _refuse(name, "wavelengths are not evenly spaced", "even steps")
-    try:
-        with np.errstate(all="ignore"):  # primaries_of_spectra rejects zeros
-            primaries = primaries_of_spectra(*columns)
-    except ValueError as error:
-        _refuse(name, str(error), "measured spectra of three primaries")
-    return ",".join(
-        f"{nm:.1f}:{width_nm:.1f}" for nm, width_nm in zip(*primaries, strict=True)
-    )
+        _refuse(name, "wavelengths are not evenly spaced", "even steps", option)
+    return found
 
 
-def _refuse(name: str, found: str, allowed: str) -> NoReturn:
-    raise InvalidFile(name, found, allowed, "display") from None
+def _refuse(name: str, found: str, allowed: str, option: str) -> NoReturn:
+    raise InvalidFile(name, found, allowed, option) from None
 
 
 def _is_header(line: str) -> bool:

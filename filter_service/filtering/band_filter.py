@@ -21,6 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from estimator.color import lms_weights, xyz_weights
 from estimator.color.observers import AGES_YEARS, STANDARD_AGE_YEARS, Observer
+from estimator.profiles.parse import EyeProfile
 from filter_service.camera import Camera
 from filter_service.constants import RGB
 from filter_service.displays import LIMITS_NM, Triple, display_wavelengths_nm
@@ -178,11 +179,7 @@ class BandFilter:
             raise BadMessage(
                 "it is True", field="wide_primaries", allowed="False for bands"
             )
-        eye = as_profile(profile)
-        has_yellowing = eye.yellowing is not None and eye.age_years is not None
-        age_years = eye.age_years if has_yellowing else None
-        self._lens_age_years = _lens_age_years(age_years)
-        eye = replace(eye, yellowing=None)
+        eye, self._lens_age_years = without_yellowing(as_profile(profile))
         self._groups = band_groups(self.wavelengths_nm, self.settings)
         self._places = np.empty((self.wavelengths_nm.size, 2), np.int64)
         for number, group in enumerate(self._groups):
@@ -396,9 +393,14 @@ def _check_bands(field: str, bands: object, count: int) -> None:
         )
 
 
-def _lens_age_years(age_years: float | None) -> float:
-    """Return the age of the lens in cone signals, within the limits of CIE 170-1."""
-    if age_years is None:
-        return STANDARD_AGE_YEARS
+def without_yellowing(eye: EyeProfile) -> tuple[EyeProfile, float]:
+    """Return an eye without yellowing, and the age of its lens in cone signals.
+
+    The cone fundamentals include the absorption of the lens.  The age is that of an eye
+    with yellowing, within the limits of CIE 170-1, and otherwise 32 years.
+    """
+    if eye.yellowing is None or eye.age_years is None:
+        return replace(eye, yellowing=None), STANDARD_AGE_YEARS
     low_years, high_years = AGES_YEARS
-    return min(max(age_years, low_years), high_years)
+    age_years = min(max(eye.age_years, low_years), high_years)
+    return replace(eye, yellowing=None), age_years

@@ -20,6 +20,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+import filter_service
 from estimator.optics.units import REFERENCE_WAVELENGTH_NM
 from estimator.optics.vergence import chromatic_refraction_dpt
 from estimator.psf.compute import compute_psfs
@@ -32,7 +33,7 @@ from filter_service.displays import (
 )
 from tests.benchmarks.harness import Row, memory_mb, publish
 
-SPECTRA = Path(__file__).parents[1] / "data" / "display_spectra.json"
+SPECTRA = Path(filter_service.__file__).with_name("display_spectra.json")
 PITCH_MRAD = 0.29
 HALF_WIDTH_MRAD = 12.0
 PUPIL_MM = 5.0

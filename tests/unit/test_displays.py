@@ -7,7 +7,9 @@ from clients.commands.options import display_of_file
 from estimator.optics.units import RGB_WAVELENGTHS_NM
 from filter_service.displays import (
     DISPLAYS,
+    MEASURED,
     WIDTHS_NM,
+    display_spectra,
     display_wavelengths_nm,
     display_widths_nm,
     matching_functions,
@@ -141,6 +143,22 @@ def test_two_wavelengths_a_primary_stand_for_it_better(name):
     assert own[1] > 51.0
     assert common[0] > 51.0
     assert common[1] > 50.0
+
+
+@pytest.mark.parametrize("name", list(MEASURED))
+def test_measured_spectra_have_the_wavelengths_and_the_white_of_their_name(name):
+    found = display_spectra(name)
+    nm, _ = primaries_of_spectra(*found)
+    assert nm == pytest.approx(DISPLAYS[name], abs=6.5)
+    matching = matching_functions(found.wavelengths_nm)[:, 1]
+    luminance = 10.0 * (found.spectra.sum(axis=1) @ matching)
+    equal_energy = matching_functions(np.arange(360.0, 831.0))[:, 1].sum()
+    assert luminance / equal_energy == pytest.approx(1.0, abs=0.01)
+
+
+def test_displays_without_spectra_are_named():
+    with pytest.raises(BadMessage, match=r"'paper'.*allowed: common, lcd, oled, crt"):
+        display_spectra("paper")
 
 
 def test_a_command_takes_spectra_from_a_file(tmp_path):
