@@ -135,7 +135,7 @@ def filter_bands(
 
     A picture has the PSFs of three wavelengths, and the spectra of a display:
 
-    ocufilter bands --color photo.png --display oled --distance-m 2 --fov-deg 20
+    ocufilter bands --color photo.jpg --display oled --distance-m 2 --fov-deg 20
     --profile myopia --as lms -o cones.npy
     """
     check_range("--pupil-mm", pupil_mm, PUPIL_LIMITS_MM)

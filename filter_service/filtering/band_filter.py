@@ -53,7 +53,8 @@ class FilteredBands:
         In the units of the input.
     wavelengths_nm : (n,)
     groups : tuple of Filtered
-        The frames of three bands each, with their counts and stage times.
+        The frames of three bands each, with their counts and stage times, and without
+        their images.
     lens_age_years : float
         Age of the lens in `lms`: the profile's age if it asks for yellowing, otherwise
         32 years.
@@ -287,9 +288,16 @@ class BandFilter:
         return FilteredBands(
             joined_bands([frame.color for frame in found], self._places),
             self.wavelengths_nm,
-            tuple(found),
+            tuple(_without_images(frame) for frame in found),
             self._lens_age_years,
         )
+
+
+def _without_images(frame: Filtered) -> Filtered:
+    """Return a frame whose images are in the bands: they would take as much memory."""
+    nothing = np.empty((0, 0, RGB), np.float32)
+    views = tuple(replace(view, color=nothing) for view in frame.views)
+    return replace(frame, views=views)
 
 
 @dataclass(frozen=True)
