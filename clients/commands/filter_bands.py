@@ -317,9 +317,9 @@ def _seen_picture(asked: _Asked, path: Path, spectra_file: str | None) -> _Seen:
         raise ValueError("--display: not allowed with --spectra, which sets it")
     else:
         source = spectra_file
-        shown = read_spectra(spectra_file, option="spectra").scaled_to_white
-        display = display_of_spectra(spectra_file, shown, option="spectra")
-        settings = settings.changed(display=display)
+        measured = read_spectra(spectra_file, option="spectra")
+        display = display_of_spectra(spectra_file, measured, option="spectra")
+        settings, shown = settings.changed(display=display), measured.scaled_to_white
     picture = read_color_file(path)
     view = RgbdView(
         picture.pixels,

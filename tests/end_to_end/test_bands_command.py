@@ -91,6 +91,15 @@ def test_white_pictures_have_the_signals_of_the_spectra_of_the_display(
     assert luminance == pytest.approx(1.0, abs=1e-5)
 
 
+def test_spectra_without_light_are_refused(picture, tmp_path):
+    (tmp_path / "dark.csv").write_text("400,0,0,0\n500,0,0,0\n600,0,0,0\n")
+    dark = ("--spectra", tmp_path / "dark.csv")
+    finished = run_command(*picture, *dark, "-o", tmp_path / "seen.npy")
+    assert finished.returncode == 2
+    assert "--spectra" in finished.stderr
+    assert "independent colors" in finished.stderr
+
+
 @pytest.mark.parametrize(
     ("more", "named"),
     [
