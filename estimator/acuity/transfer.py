@@ -420,11 +420,25 @@ def clear_pupil(
     """
     clear: NDArray[Any] = _inside_grid(along_mm, zernike_radius_mm, pupil_ellipse)
     if pupil_screen is not None:
-        x_mm, y_mm = np.meshgrid(along_mm, along_mm)
-        cx, cy = cast("tuple[float, float]", pupil_screen.centre_mm)  # one center
-        square_mm2 = (x_mm - cx) ** 2 + (y_mm - cy) ** 2
-        clear = clear * pupil_screen.transmission(square_mm2, wavelength_nm)
+        clear = clear * _screen_grid(along_mm, wavelength_nm, pupil_screen)
     return clear
+
+
+def _screen_grid(
+    along_mm: NDArray[np.float64], wavelength_nm: float, screen: PupilScreen
+) -> NDArray[np.complex128]:
+    """Return the amplitude (n, n) of a screen on a grid; one quadrant if it repeats."""
+    cx, cy = cast("tuple[float, float]", screen.centre_mm)  # one center
+    count, is_central = len(along_mm), cx == cy == 0.0
+    if is_central and np.array_equal(along_mm, -along_mm[::-1]):
+        count = -(-count // 2)
+    x_mm, y_mm = np.meshgrid(along_mm[:count], along_mm[:count])
+    square_mm2 = (x_mm - cx) ** 2 + (y_mm - cy) ** 2
+    found: NDArray[np.complex128] = screen.transmission(square_mm2, wavelength_nm)
+    missing = len(along_mm) - count
+    for _ in range(2 if missing else 0):
+        found = np.concatenate([found, found[:missing][::-1]]).T
+    return found
 
 
 def grid_wavefront_um(
