@@ -210,7 +210,7 @@ RESIDUAL = (RESIDUAL_SPHERE, RESIDUAL_CYLINDER, RESIDUAL_AXIS)
 
 STRAYLIGHT = NumberField("log_s", "log s at 7°", "", 0.5, 2.5, 0.05, 1.2)
 ABERRATION = NumberField(
-    *("spherical_aberration_um", "C(4,0), 6 mm", "µm", -2.0, 2.0, 0.01),
+    *("spherical_aberration_um", "Spherical aberration", "µm", -2.0, 2.0, 0.01),
     is_signed=True,
 )
 CORRECTION = (

@@ -105,12 +105,15 @@ HINTS: dict[WornKind, str] = {
     "gaze sliders to look through other parts of the lens.",
     "lenslets": "396 lenslets around a clear center; use the gaze sliders to look "
     "through other parts.",
+    "contact_lens": "Spherical aberration is what the lens adds: C(4,0) through 6 mm.",
     "iol": "Replaces the natural lens of the eye above, whose length and cornea stay. "
     "Its power is chosen such that the residual refraction remains: 0 is sharp far "
     "away. Accommodation, and haze and yellowing of the natural lens, are gone. "
-    "Additions apply at the lens.",
+    "Additions apply at the lens. Spherical aberration is what the lens adds to the "
+    "cornea: C(4,0) through 6 mm.",
     "laser": "Reshapes the cornea of the eye above, such that the residual refraction "
-    "remains. Everything else in the eye stays.",
+    "remains. Everything else in the eye stays. Spherical aberration is what the "
+    "surgery adds: C(4,0) through 6 mm.",
 }
 
 FIELDS_BY_KIND: dict[WornKind, tuple[NumberField, ...]] = {

@@ -30,6 +30,9 @@ A traced eye matches its prescription within this limit.  The difference is invi
 it displaces rays through a 6 mm pupil by at most 0.1 arcmin.
 """
 
+NOTICED_DPT = 0.25
+"""Smallest step of a refraction: less blur is hardly noticed."""
+
 RANGE_PUPIL_COUNT = 5
 """Number of pupils in a range for which the accommodation is computed.  A few suffice,
 because the accommodation changes slowly and smoothly with the pupil."""
@@ -135,39 +138,45 @@ class Focusing(ABC):
         if focus_dpt < far_dpt - OUT_OF_REACH_DPT:
             note = Note(
                 "focus_beyond_far_point",
-                f"focus {focus_dpt:g} dpt is beyond the far point "
-                f"({far_dpt:.3g} dpt): the eye stays relaxed",
+                f"blurred: nothing beyond {_distance(far_dpt)} is sharp; focus "
+                f"{focus_dpt:g} dpt is beyond the far point ({far_dpt:.3g} dpt): the "
+                "eye stays relaxed",
                 focus_dpt=focus_dpt,
                 far_point_dpt=far_dpt,
             )
             return (note,)
         if focus_dpt <= near_dpt + OUT_OF_REACH_DPT:
             return ()
-        code, reached = (
-            (
-                "focus_nearer_than_near_point",
-                "is nearer than the near point "
-                f"({max(0.0, round(near_dpt, 3)):.3g} dpt)",
-            )
-            if near_dpt > -OUT_OF_REACH_DPT
-            else (
-                "focus_out_of_reach",
-                f"is out of reach, as are all distances, by {-near_dpt:.3g} dpt or "
-                "more",
-            )
-        )
+        if near_dpt > -OUT_OF_REACH_DPT:
+            code = "focus_nearer_than_near_point"
+            nearest_dpt = max(0.0, round(near_dpt, 3))
+            seen = f"nothing nearer than {_distance(nearest_dpt)} is sharp"
+            reached = f"is nearer than the near point ({nearest_dpt:.3g} dpt)"
+        else:
+            code = "focus_out_of_reach"
+            little = ", which few people notice" if near_dpt > -NOTICED_DPT else ""
+            seen = f"the eye lacks {-near_dpt:.2g} dpt even for far distances{little}"
+            reached = f"is out of reach by {focus_dpt - near_dpt:.3g} dpt"
         added_dpt = self.vergence.vergence_dpt(near_dpt) - self.vergence.vergence_dpt(
             far_dpt
         )
         note = Note(
             code,
-            f"focus {focus_dpt:g} dpt {reached}: "
+            f"blurred: {seen}; focus {focus_dpt:g} dpt {reached}: "
             f"accommodation stops at {added_dpt:.3g} dpt",
             focus_dpt=focus_dpt,
             near_point_dpt=near_dpt,
             accommodation_dpt=added_dpt,
         )
         return (note,)
+
+
+def _distance(vergence_dpt: float) -> str:
+    """Return a distance in meters or centimeters."""
+    if vergence_dpt <= OUT_OF_REACH_DPT:
+        return "far distances"
+    meters = 1.0 / vergence_dpt
+    return f"{100.0 * meters:.0f} cm" if meters < 1.0 else f"{meters:.1f} m"
 
 
 @dataclass(frozen=True)
