@@ -17,12 +17,16 @@ from .corrections.rings import Lenslets as Lenslets
 from .corrections.rings import RefractiveZones as RefractiveZones
 from .corrections.rings import Rings as Rings
 from .corrections.worn_lens import WornLens as WornLens
+from .estimate.biometry import EyeBiometry as EyeBiometry
+from .estimate.biometry import eye_biometry as eye_biometry
 from .estimate.estimation import EstimatedEye as EstimatedEye
 from .estimate.estimation import estimate_eye as estimate_eye
 from .estimate.given_surfaces import GivenSurfaces as GivenSurfaces
 from .estimate.model import EyeModel as EyeModel
 from .estimate.model import eye_model as eye_model
 from .estimate.plot import draw_section as draw_section
+from .estimate.surgery import EyeWithImplant as EyeWithImplant
+from .estimate.surgery import natural_eye as natural_eye
 from .eye.checked_fields import ProfileError as ProfileError
 from .eye.parameters import EyeParameters as EyeParameters
 from .field.eye_optics import EyeOptics as EyeOptics

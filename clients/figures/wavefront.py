@@ -41,6 +41,7 @@ from clients.figures.style import (
     with_grid,
 )
 from estimator import (
+    EyeWithImplant,
     WornLens,
     compute_psfs,
     draw_section,
@@ -57,6 +58,9 @@ LOWEST_BLURRING_ORDER, LOWEST_HIGHER_ORDER = 2, 3
 
 SIDE_COUNT = 161
 LEVEL_COUNT = 13
+LEAST_RMS_UM = 5e-4
+"""Smallest RMS of a map; less is numerical."""
+
 MIN_RANGE_UM = 0.05
 """Smallest half range of the colors; below a tenth of a wave there is no shape."""
 
@@ -140,7 +144,7 @@ def draw_rms_by_order(
     axes.margins(y=0.4 if labels else 0.18)  # labels are above the bars
     axes.set_ylim(0.0, max(axes.get_ylim()[1], MIN_AXIS_LIMIT_UM))
     note = f"{2 * radius_mm:.1f} mm pupil; order 2: {', '.join(seconds)} µm"
-    title = f"RMS by radial order{studies[0].assumed_suffix}"
+    title = f"RMS by order{studies[0].assumed_suffix}"
     style_axes(axes, title=title, x=f"radial order\n{note}", y="RMS, µm")
     axes.xaxis.label.set_fontsize(SMALL_PT)
     if labels:
@@ -218,6 +222,10 @@ def draw_wavefront_map(
     zernike_um : (28,)
         Coefficients in the eye's frame, x to the person's right.
     """
+    rms = rms_um(zernike_um, from_order=from_order)
+    if rms < LEAST_RMS_UM:
+        _draw_no_map(axes, title)
+        return
     values = wavefront_values_um(zernike_um, from_order=from_order)[:, ::-1]
     top = max(float(np.abs(values[in_circle(SIDE_COUNT)]).max()), MIN_RANGE_UM)
     drawn = axes.imshow(
@@ -247,11 +255,20 @@ def draw_wavefront_map(
             ha="center", va="center",
         )  # fmt: skip
     axes.set_xlim(-1.2 * radius_mm, 1.2 * radius_mm)
-    rms = rms_um(zernike_um, from_order=from_order)
     axes.set_xlabel(
         f"{2 * radius_mm:.1f} mm pupil, RMS {rms:.2f} µm", fontsize=SMALL_PT, color=SOFT
     )
     color_bar(axes, drawn, label="µm")
+
+
+def _draw_no_map(axes: Axes, title: str) -> None:
+    """Say that there is nothing to draw: none are measured, entered or assumed."""
+    style_image_axes(axes, title=title)
+    axes.text(
+        0.5, 0.5, "none are known,\nand none are assumed", color=SOFT,
+        fontsize=SMALL_PT, ha="center", va="center", transform=axes.transAxes,
+    )  # fmt: skip
+    axes.set_box_aspect(1.0)
 
 
 def draw_wavefront_maps(panel: FigureBase, study: EyeStudy) -> None:
@@ -408,7 +425,8 @@ def draw_psfs(
     ):
         for axes, wavefront in zip(across, wavefronts, strict=True):
             draw_psf(axes, centered(wavefront)[0], side_arcmin=side_arcmin)
-        across[0].set_ylabel(name, fontsize=TEXT_PT)
+        # on two lines, because the images may be lower than the text is long
+        across[0].set_ylabel(name.replace(" ", "\n", 1), fontsize=TEXT_PT)
     for axes, state in zip(grid[0], rows["as it is"], strict=True):
         axes.set_title(f"{state.circle_diameter_mm:.3g} mm", fontsize=TEXT_PT)
 
@@ -423,7 +441,8 @@ def psfs_figure(study: EyeStudy) -> Figure:
 def draw_cross_section(axes: Axes, study: EyeStudy) -> None:
     """Draw an eye focused far, with rays from infinity through its correction.
 
-    An intraocular lens is not drawn: the eye model has its natural lens.
+    An implant is drawn if the eye is traced through it; an intraocular lens that acts
+    as a phase is not.
     """
     focused, lens = study.found.focused(0.0), study.profile.correction
     if isinstance(lens, WornLens) and lens.replaces_lens:
@@ -431,6 +450,8 @@ def draw_cross_section(axes: Axes, study: EyeStudy) -> None:
     draw_section(axes, focused.surfaces, pupil_diameter_mm=FIELD_PUPIL_MM, lens=lens)
     length_mm = study.found.eye_length_mm
     suffix = "" if lens is None else ", corrected"
+    if isinstance(study.found, EyeWithImplant):
+        suffix = ", implant"
     style_axes(
         axes,
         title=f"Vertical section, {length_mm:.2f} mm long{suffix}",

@@ -10,6 +10,8 @@ from typing import Any, cast
 
 from matplotlib.figure import FigureBase
 
+from clients.acuity_text import Notation
+from clients.acuity_text import acuity_text as acuity_in
 from clients.figures import (
     EyeStudy,
     draw_acuity_of_several,
@@ -45,6 +47,7 @@ from clients.report.html_page import (
     Text,
 )
 from clients.report.tables import (
+    NOTATION_WORDS,
     REFRACTION_ROWS,
     VISION_ROWS,
     acuity_text,
@@ -61,15 +64,15 @@ from clients.report.tables import (
 )
 from clients.report.text import (
     Citations,
-    correction_text,
     entered_text,
     limits_text,
     method_text,
     near_text,
     people_text,
     provenance_table,
+    treatment_text,
 )
-from clients.scenes.letter_chart import row_text, smallest_row
+from clients.scenes.letter_chart import smallest_row
 
 DAY_MM, DUSK_MM = PUPILS_MM
 
@@ -148,9 +151,8 @@ def subtitle(study: EyeStudy) -> str:
     source = f"from {KIND_LABELS[profile.kind]}"
     if study.is_example:
         source = f"example eye (preset {profile.name})"
-    lens = profile.correction
-    worn = "" if lens is None else f"; {correction_text(lens)}"
-    return f"{side}, {age}, {source}{worn}"
+    treatment = treatment_text(study)
+    return f"{side}, {age}, {source}{f'; {treatment}' if treatment else ''}"
 
 
 def summary(facts: EyeFacts) -> Section:
@@ -180,7 +182,10 @@ def summary(facts: EyeFacts) -> Section:
         PSF_MM,
         "Modulation transfer functions through 3 and 5 mm",
     )
-    texts = legend(study) + _band_text(facts), *limits_text(study.profile)
+    texts = (
+        legend(study, facts.notation) + _band_text(facts),
+        *limits_text(study.profile),
+    )
     return Section(
         "Summary",
         (
@@ -193,7 +198,7 @@ def summary(facts: EyeFacts) -> Section:
     )
 
 
-def legend(study: EyeStudy) -> str:
+def legend(study: EyeStudy, notation: Notation = "decimal") -> str:
     """Return the explanation of a report's maps, states and charts."""
     return (
         "Wavefront at the cornea, without a correction, as the examiner faces the eye "
@@ -203,8 +208,8 @@ def legend(study: EyeStudy) -> str:
         + (", through the worn correction" if study.profile.correction else "")
         + ". “Best corrected”: with the sphere and cylinder of the highest visual "
         "Strehl ratio through that pupil, and an acuity not below “as it is”. Charts: "
-        "the eye tries to focus on each; rows in logMAR and decimal, ◂ the smallest "
-        "read."
+        "the eye tries to focus on each; rows in "
+        f"{NOTATION_WORDS[notation]}, ◂ the smallest read."
     )
 
 
@@ -241,22 +246,28 @@ def chart_row(facts: EyeFacts, pupil_mm: float, *, name: str = "") -> Row:
             Picture(
                 facts.charts[pupil_mm, distance_m],
                 f"{start}{where}, {pupil_mm:g} mm: {unit}{acuity_text(found)}{near}",
-                _row_marks(found),
+                _row_marks(found, facts.notation),
             )
         )
     return Row(tuple(pictures))
 
 
-def _row_marks(found: dict[str, Any]) -> tuple[Mark, ...]:
+def _row_marks(found: dict[str, Any], notation: Notation) -> tuple[Mark, ...]:
     """Return the size of each row, and which one is the smallest line read."""
     rows = chart_rows()
     sizes = [log_mar for log_mar, _ in rows]
     acuity = found["log_mar"]
     read = None if acuity is None else smallest_row(sizes, acuity)
     return tuple(
-        Mark(y_ratio, row_text(log_mar), k == read)
+        Mark(y_ratio, _row_text(log_mar, notation), k == read)
         for k, (log_mar, y_ratio) in enumerate(rows)
     )
+
+
+def _row_text(log_mar: float, notation: Notation) -> str:
+    """Return the size of a row in logMAR, and in the notation if it is another."""
+    notations: tuple[Notation, ...] = ("log_mar", notation)
+    return " · ".join(acuity_in(log_mar, each) for each in dict.fromkeys(notations))
 
 
 def field_row(facts: EyeFacts, *, name: str = "", height_mm: float = FIELD_MM) -> Row:
@@ -347,19 +358,23 @@ def comparison_document(before: EyeFacts, after: EyeFacts) -> Document:
 def _difference(before: EyeFacts, after: EyeFacts) -> Section:
     studies, labels = (before.study, after.study), (before.label, after.label)
     pairs = list(zip(studies, labels, strict=True))
-    tables = _refraction_table(before, after), _vision_table(before, after)
+    tables = [_refraction_table(before, after), _vision_table(before, after)]
+    if all("biometry" in facts.numbers["eye"] for facts in (before, after)):
+        tables.append(_biometry_table(before, after))
     bars = on_axes(
         lambda axes: draw_rms_by_order(axes, studies, labels=labels),
         PAIR_MAP_MM,
         "Root mean square by radial order of both eyes",
     )
     return Section(
-        "Both eyes of this report",
+        "Before and after"
+        if _moments(before, after) == ("before", "after")
+        else "Both eyes of this report",
         (
             *(Row((table,)) for table in tables),
             Row((*(_map(*pair, studies) for pair in pairs), bars)),
             Row(tuple(_psfs(*pair, psf_sides_arcmin(studies)) for pair in pairs)),
-            Row((Text((legend(after.study),)),)),
+            Row((Text((legend(after.study, after.notation),)),)),
             *(Row((Text(limits),)) for limits in _limits(before, after)),
         ),
     )
@@ -480,6 +495,32 @@ def _refraction_table(before: EyeFacts, after: EyeFacts) -> Table:
     )
 
 
+BIOMETRY_ROWS = {
+    "axial_length_mm": "length, mm",
+    "keratometry_dpt": "K, dpt",
+    "chamber_depth_mm": "chamber, mm",
+    "lens_thickness_mm": "lens thickness, mm",
+    "lens_power_dpt": "lens power, dpt",
+}
+
+
+def _biometry_table(before: EyeFacts, after: EyeFacts) -> Table:
+    both = [facts.numbers["eye"]["biometry"] for facts in (before, after)]
+    moments = _moments(before, after)
+    rows = [
+        (moment, *(f"{found[name]:.2f}" for name in BIOMETRY_ROWS))
+        for moment, found in zip(moments, both, strict=True)
+    ]
+    changes = (change_text(both[0][name], both[1][name]) for name in BIOMETRY_ROWS)
+    return Table(
+        "Lengths and powers of the estimated eyes",
+        (*rows, ("change", *changes)),
+        head=("", *BIOMETRY_ROWS.values()),
+        note="K of the front of the cornea, index 1.3375; chamber from the front of "
+        "the cornea to the lens or implant; lens power in the eye, at 555 nm.",
+    )
+
+
 def _eye_note(moment: str, facts: EyeFacts) -> str:
     """Return the name of an eye, its powers as entered, and spectacles for it."""
     entered = entered_text(facts.study.profile)
@@ -508,7 +549,9 @@ def _vision_table(before: EyeFacts, after: EyeFacts) -> Table:
         rows,
         head=head,
         groups=(("", 1), *groups),
-        note=vision_note([numbers for found in pupils for numbers in found]),
+        note=vision_note(
+            [numbers for found in pupils for numbers in found], before.notation
+        ),
     )
 
 

@@ -9,13 +9,14 @@ from __future__ import annotations
 import math
 import unicodedata
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from functools import cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from clients.acuity_text import Notation
 from clients.figures import (
     DrawnPeople,
     EyeStudy,
@@ -38,6 +39,7 @@ from estimator import (
     EyeProfile,
     Prescription,
     chromatic_refraction_dpt,
+    eye_biometry,
     nm_from_index,
     percentiles_of,
     power_vector,
@@ -192,12 +194,13 @@ def refraction_of(study: EyeStudy, zernike_um: NDArray[np.float64]) -> dict[str,
     return refraction_numbers(m + float(to_555_dpt), j0, j45)
 
 
-def state_numbers(seen: PupilWavefront) -> dict[str, Any]:
+def state_numbers(seen: PupilWavefront, notation: Notation) -> dict[str, Any]:
     """Return the modulation transfer and acuity of a wavefront."""
     found = seen.predicted
     if found is None:
         return {
             "log_mar": None,
+            "notation": notation,
             "visual_strehl_ratio": None,
             "modulation": None,
             "is_told": seen.is_readable,
@@ -205,6 +208,7 @@ def state_numbers(seen: PupilWavefront) -> dict[str, Any]:
     modulation = seen.transfer().modulation(np.array(REPORTED_CPD))
     return {
         "log_mar": found.log_mar,
+        "notation": notation,
         "visual_strehl_ratio": found.visual_strehl_ratio,
         "modulation": {
             f"{cpd:g}_cpd": float(v)
@@ -214,7 +218,9 @@ def state_numbers(seen: PupilWavefront) -> dict[str, Any]:
     }
 
 
-def pupil_numbers(study: EyeStudy, pupil_diameter_mm: float) -> dict[str, Any]:
+def pupil_numbers(
+    study: EyeStudy, pupil_diameter_mm: float, notation: Notation
+) -> dict[str, Any]:
     """Return the numbers of a far object through a pupil, as is and best corrected."""
     seen = study.far(pupil_diameter_mm)
     higher_um = rms_um(seen.zernike_um)
@@ -225,8 +231,8 @@ def pupil_numbers(study: EyeStudy, pupil_diameter_mm: float) -> dict[str, Any]:
         "higher_order_rms_um": higher_um,
         "far_point_dpt": far_dpt,
         "near_point_dpt": near_dpt,
-        "as_it_is": state_numbers(seen),
-        "best_corrected": state_numbers(seen.best_corrected),
+        "as_it_is": state_numbers(seen, notation),
+        "best_corrected": state_numbers(seen.best_corrected, notation),
     }
 
 
@@ -236,7 +242,10 @@ def is_beyond_measured(study: EyeStudy, pupil_diameter_mm: float) -> bool:
 
 
 def chart_numbers(
-    study: EyeStudy, pupil_diameter_mm: float, distance_m: float
+    study: EyeStudy,
+    pupil_diameter_mm: float,
+    distance_m: float,
+    notation: Notation = "decimal",
 ) -> dict[str, Any]:
     """Return the predicted acuity on a chart of an eye that accommodates for it."""
     at_dpt = 1.0 / distance_m
@@ -250,11 +259,12 @@ def chart_numbers(
             at_dpt, pupil_diameter_mm=usable_mm
         ),
         "log_mar": log_mar if np.isfinite(log_mar) else None,
+        "notation": notation,
         "is_told": seen.is_readable,
     }
 
 
-def eye_numbers(study: EyeStudy) -> dict[str, Any]:
+def eye_numbers(study: EyeStudy, notation: Notation = "decimal") -> dict[str, Any]:
     """Return the numbers of one eye, ready for JSON."""
     profile, found = study.profile, study.found
     worn = profile.correction
@@ -272,6 +282,7 @@ def eye_numbers(study: EyeStudy) -> dict[str, Any]:
             "mean_abs_error_um": found.mean_abs_error_um,
             "rms_error_um": float(np.linalg.norm(found.residual_um[3:])),
             "eye_length_mm": length_mm,
+            **_biometry_numbers(study),
             "amplitude_dpt": found.amplitude_dpt,
             # M of the relaxed eye through its correction, at its entrance pupil
             "refraction_through_correction_dpt": float(
@@ -284,10 +295,18 @@ def eye_numbers(study: EyeStudy) -> dict[str, Any]:
             "on_bound": list(found.on_bound),
         },
         "correction": None if worn is None else refraction_numbers(*power_vector(worn)),
-        "pupils": [pupil_numbers(study, pupil_mm) for pupil_mm in PUPILS_MM],
+        "pupils": [pupil_numbers(study, mm, notation) for mm in PUPILS_MM],
         "field": _field_numbers(study),
         "notes": [*study.notes],
     }
+
+
+def _biometry_numbers(study: EyeStudy) -> dict[str, dict[str, float]]:
+    """Return lengths and powers; empty for eyes with other surfaces."""
+    try:
+        return {"biometry": asdict(eye_biometry(study.found.relaxed))}
+    except ValueError:
+        return {}
 
 
 def measured_numbers(study: EyeStudy) -> dict[str, Any]:
@@ -443,6 +462,8 @@ class EyeFacts:
         not be computed; ``chart_problem`` gives the reason.
     people : DrawnPeople or None
         Persons drawn from the population, if requested.
+    notation : Notation
+        Of acuities, beside logMAR.
     """
 
     study: EyeStudy
@@ -451,6 +472,7 @@ class EyeFacts:
     charts: dict[Chart, NDArray[np.uint8]] = field(default_factory=dict)
     chart_problem: str = ""
     people: DrawnPeople | None = None
+    notation: Notation = "decimal"
 
     @property
     def chart_numbers(self) -> dict[Chart, dict[str, Any]]:
@@ -471,6 +493,7 @@ def facts_of(
     label: str = "",
     has_charts: bool = True,
     people: int | None = None,
+    notation: Notation = "decimal",
     progress: ProgressCallback | None = None,
 ) -> EyeFacts:
     """Compute the content of a report on an eye.
@@ -483,6 +506,8 @@ def facts_of(
         Whether to filter letter charts (about a quarter of the run time).
     people : int, optional
         Number of persons to draw from the population.
+    notation : {"decimal", "feet", "meters", "log_mar"}
+        Notation of acuities, beside logMAR.
     progress : callable, optional
         Called with a fraction and a stage.
 
@@ -498,9 +523,9 @@ def facts_of(
     report(0.0, "eye")
     study = EyeStudy.of(profile)
     report(eye_share * NUMBERS_START_FRACTION, "numbers")
-    numbers = eye_numbers(study)
+    numbers = eye_numbers(study, notation)
     numbers["charts"] = [
-        chart_numbers(study, pupil_mm, distance_m)
+        chart_numbers(study, pupil_mm, distance_m, notation)
         for pupil_mm in PUPILS_MM
         for distance_m in DISTANCES_M
     ]
@@ -528,5 +553,11 @@ def facts_of(
         )
         numbers["people"] = people_numbers(drawn)
     return EyeFacts(
-        study, label or own_name(study.profile), numbers, charts, problem, drawn
+        study,
+        label or own_name(study.profile),
+        numbers,
+        charts,
+        problem,
+        drawn,
+        notation,
     )

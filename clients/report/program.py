@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from clients.acuity_text import Notation
 from clients.figures.study import profile_of
 from clients.report.facts import check_text, shortened
 from clients.report.make import (
@@ -73,6 +74,13 @@ def report(
             "per person on two cores, 0.1 s with a wavefront measured on the axis.",
         ),
     ] = None,
+    notation: Annotated[
+        Notation,
+        typer.Option(
+            help="Notation of acuities beside logMAR: 20/40 (feet), 6/12 (meters) or "
+            "0.50 (decimal)."
+        ),
+    ] = "decimal",
     json_output: Json = False,
 ) -> None:
     """Write a report on one eye, or a comparison of two, as HTML or PDF.
@@ -121,6 +129,7 @@ def report(
             labels=labels,
             has_charts=not no_charts and out is not None,
             people=people,
+            notation=notation,
             progress=task.update,
         )
         if out is not None:

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any
 
+from clients.acuity_text import Notation
+from clients.acuity_text import acuity_text as acuity_in
 from clients.figures.study import WAVELENGTH_NM
 from clients.report.facts import (
     SPECTACLE_VERTEX_MM,
@@ -101,7 +103,7 @@ def vision_table(facts: EyeFacts) -> Table:
         (label, *map(format_value, pupils))
         for label, format_value in VISION_ROWS.items()
     ]
-    note = vision_note(pupils)
+    note = vision_note(pupils, facts.notation)
     drawn = facts.numbers.get("people", {"pupils": []})
     if drawn["pupils"]:
         texts = (range_text(p["higher_order_rms_um"]) for p in drawn["pupils"])
@@ -115,10 +117,10 @@ def vision_table(facts: EyeFacts) -> Table:
     )
 
 
-def vision_note(pupils: list[dict[str, Any]]) -> str:
+def vision_note(pupils: list[dict[str, Any]], notation: Notation) -> str:
     """Return the note below numbers of vision through some pupils."""
     note = (
-        "Acuity in logMAR, and as a decimal, in white light. Higher orders: in the "
+        f"Acuity in {NOTATION_WORDS[notation]}, in white light. Higher orders: in the "
         "entrance pupil; maps and bars show them at the cornea."
     )
     if any(p["is_beyond_measured"] for p in pupils):
@@ -137,6 +139,12 @@ def distance_text(distance_dpt: float) -> str:
     return f"{distance_dpt:.2f} ({where})"
 
 
+NOTATION_WORDS: dict[Notation, str] = {
+    "decimal": "logMAR and decimal",
+    "feet": "logMAR and as 20/20",
+    "meters": "logMAR and as 6/6",
+    "log_mar": "logMAR",
+}
 LEAST_RATIO = 0.0005
 """Smallest visual Strehl ratio that three decimals show."""
 
@@ -178,15 +186,13 @@ def _modulations(values: dict[str, Any] | None) -> str:
 
 def acuity_text(state: dict[str, Any]) -> str:
     """Return the acuity of a state, or that it is not known."""
-    return acuity_range_text(state["log_mar"]) if state["is_told"] else UNKNOWN_ACUITY
-
-
-def acuity_range_text(log_mar: float | None) -> str:
-    """Return an acuity in logMAR and as a decimal fraction."""
-    if log_mar is None:
+    if not state["is_told"]:
+        return UNKNOWN_ACUITY
+    if state["log_mar"] is None:
         return "worse than 2"
+    log_mar, notation = state["log_mar"], state["notation"]
     text = f"{log_mar:+.2f}".replace("-", "−")
-    return f"{text} ({10.0**-log_mar:.2f})"
+    return text if notation == "log_mar" else f"{text} ({acuity_in(log_mar, notation)})"
 
 
 def coefficient_table(

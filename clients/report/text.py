@@ -18,7 +18,9 @@ from clients.report.facts import EyeFacts, format_prescription, is_beyond_measur
 from clients.report.html_page import Table
 from estimator import (
     DiffractiveRings,
+    EstimatedEye,
     EyeProfile,
+    EyeWithImplant,
     GivenSurfaces,
     Lenslets,
     Prescription,
@@ -29,6 +31,7 @@ from estimator import (
     draws_axis,
     draws_eye,
     draws_periphery,
+    natural_eye,
 )
 
 SOURCES = {
@@ -64,6 +67,10 @@ SOURCES = {
     "straylight": "Vos & van den Berg 1999 (CIE Research Note 135/1), van den Berg et "
     "al. 2007 (Am J Ophthalmol 144:358): light scattered in the eye",
     "cataract": "J Ophthalmol 2017:5649532: straylight of cataracts before surgery",
+    "olsen": "Olsen & Hoffmann 2014 (J Cataract Refract Surg 40:764): position of an "
+    "implant",
+    "pseudophakic": "Nakajima, Hiraoka, Yamamoto et al. 2016 (PLoS One 11:e0156227): "
+    "color of eyes with implants",
     "synteyes": "Rozema, Rodriguez, Navarro & Tassignon 2016 (IOVS 57:683): SyntEyes, "
     "a statistical model of the biometry of 312 eyes",
 }
@@ -136,6 +143,20 @@ def short_text(lens: Prescription) -> str:
     if lens.kind == "contact_lens":
         return "contact lens"
     return f"intraocular lens, {DESIGNS[lens.design]}"
+
+
+def treatment_text(study: EyeStudy) -> str:
+    """Return the correction worn, or the surgery; empty without."""
+    lens, surgery, found = study.profile.correction, study.profile.surgery, study.found
+    if surgery is None:
+        return "" if lens is None else correction_text(lens)
+    parts = ["laser surgery"]
+    if isinstance(found, EyeWithImplant) and isinstance(lens, WornLens):
+        parts = [f"{short_text(lens)}, of {found.implant.power_dpt:.2f} dpt"]
+        if found.implant.cylinder_dpt >= 0.005:
+            parts.append(f"toric by {found.implant.cylinder_dpt:.2f} dpt")
+        parts += _alignment(lens)
+    return ", ".join([*parts, f"residual {format_prescription(surgery.residual)}"])
 
 
 def correction_text(lens: Prescription) -> str:
@@ -241,8 +262,9 @@ def limits_text(profile: EyeProfile) -> tuple[str, ...]:
             "the lens has another power.",
         )
     if isinstance(lens, WornLens) and lens.replaces_lens:
-        # the implant of a pseudophakic eye is traced by its surfaces
-        limits = () if profile.surfaces is not None else (IMPLANT_LIMITS,)
+        # the eye is traced through its implant, if that is known by its surfaces
+        is_traced = profile.surfaces is not None or profile.surgery is not None
+        limits = () if is_traced else (IMPLANT_LIMITS,)
         return (*limits, *_rings_limits(lens))
     return _rings_limits(lens)
 
@@ -301,7 +323,8 @@ def entered_text(profile: EyeProfile) -> str:
         if name == "prescription":
             powers, _, missing = text.partition("; ")
             hint = ", no vertex distance given" if missing else ""
-            return f"Entered: {powers}{hint}.".replace("-", "−")
+            when = "" if profile.surgery is None else " before surgery"
+            return f"Entered{when}: {powers}{hint}.".replace("-", "−")
     return ""
 
 
@@ -319,6 +342,7 @@ def _model_text(study: EyeStudy) -> str:
     return (
         f"{poor}the eye model reproduces the coefficients of the wavefront to "
         f"{um_text(found.mean_abs_error_um)} on average"
+        + (" before surgery" if study.profile.surgery is not None else "")
     )
 
 
@@ -395,6 +419,13 @@ def _rows(study: EyeStudy, cite: Citations) -> tuple[tuple[str, ...], ...]:
 
 def _refraction(study: EyeStudy) -> tuple[str, ...]:
     profile = study.profile
+    if profile.surgery is not None:
+        text = "the residual of the surgery; before it, "
+        if profile.kind == "prescription":
+            text += "the prescription, as powers at the cornea"
+        else:
+            text += f"second order of {_measurement(study)}"
+        return ("Refraction", STATED, text)
     if profile.kind == "prescription":
         return ("Refraction", STATED, "the prescription, as powers at the cornea")
     if profile.is_given:
@@ -421,6 +452,12 @@ def _higher_orders(study: EyeStudy, cite: Citations) -> tuple[str, ...]:
     profile = study.profile
     if profile.is_given:
         return ("Higher orders", STATED, "of the eye that the profile gives")
+    if isinstance(study.found, EyeWithImplant):
+        text = (
+            "the estimated cornea's and the implant's; those of the natural lens are "
+            "gone, and how cornea and lens shared them is assumed"
+        )
+        return ("Higher orders", TYPICAL, text)
     if profile.kind != "prescription":
         text = f"orders 3 to 6 of {_measurement(study)}"
         return ("Higher orders", _origin(study), text)
@@ -503,8 +540,8 @@ def _replaces_lens(lens: Prescription | None) -> bool:
 
 
 def _shape(study: EyeStudy, cite: Citations) -> tuple[str, ...]:
-    found = study.found
-    if isinstance(found, GivenSurfaces):
+    found = natural_eye(study.found)
+    if not isinstance(found, EstimatedEye):
         return ("Shape of the eye", STATED, "the surfaces of the profile")
     if study.profile.is_given:
         return ("Shape of the eye", STATED, "the 45 parameters of the profile")
@@ -514,10 +551,16 @@ def _shape(study: EyeStudy, cite: Citations) -> tuple[str, ...]:
         f"{count} of 45 parameters are mostly determined by the wavefront; the "
         f"others describe a mean eye with this refraction {cite('csoba', 'length')}"
     )
+    if isinstance(study.found, EyeWithImplant):
+        text += f"; the implant is placed by the natural lens {cite('olsen')}"
     return ("Shape of the eye", TYPICAL, text)
 
 
 def _color(study: EyeStudy, cite: Citations) -> tuple[str, ...]:
+    if isinstance(study.found, EyeWithImplant):
+        source = cite("pseudophakic")
+        text = f"longitudinal color of eyes with their natural lens {source}"
+        return ("Color", TYPICAL, text)
     if isinstance(study.found, GivenSurfaces):
         return ("Color", STATED, "dispersion of the media that the profile gives")
     return ("Color", TYPICAL, f"longitudinal color of measured eyes {cite('color')}")
@@ -534,5 +577,6 @@ def _media(study: EyeStudy, cite: Citations) -> tuple[str, ...]:
 
 
 def _worn(study: EyeStudy) -> tuple[str, ...]:
-    lens = study.profile.correction
-    return () if lens is None else ("Correction worn", STATED, correction_text(lens))
+    text = treatment_text(study)
+    name = "Correction worn" if study.profile.surgery is None else "Surgery"
+    return (name, STATED, text) if text else ()

@@ -8,6 +8,7 @@ problem            prior, compared coefficients, and the pattern search of earli
 bounded_fit        least squares with bounds
 measured_residual  residual of the estimate, kept as a phase
 eye_table.json     start eyes of a fit
+biometry           lengths and powers of an eye
 plot               plot of an estimated eye
 """
 

@@ -1,6 +1,10 @@
+from .biometry import EyeBiometry as EyeBiometry
+from .biometry import eye_biometry as eye_biometry
 from .estimation import EstimatedEye as EstimatedEye
 from .estimation import estimate_eye as estimate_eye
 from .given_surfaces import GivenSurfaces as GivenSurfaces
 from .model import EyeModel as EyeModel
 from .model import eye_model as eye_model
 from .plot import plot_eye as plot_eye
+from .surgery import EyeWithImplant as EyeWithImplant
+from .surgery import natural_eye as natural_eye

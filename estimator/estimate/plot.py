@@ -27,6 +27,8 @@ OBJECT_SIDE_MM = 5.0
 """Distance in front of the cornea, or of a lens, from which rays are drawn."""
 
 LENS, LENS_HALF_HEIGHT_MM = "tab:blue", 8.0
+IMPLANT, IMPLANT_HALF_HEIGHT_MM = "implant", 3.0
+"""Medium of an intraocular lens, and half the diameter of its optic."""
 
 
 def surface_line_mm(
@@ -104,9 +106,15 @@ def draw_section(
     lens : Prescription, optional
         Thin lens in front of the eye that the rays pass.
     """
+    medium = ""
     for surface, half_height_mm in zip(eye.surfaces, HALF_HEIGHTS_MM, strict=True):
+        is_implant = IMPLANT in (medium, surface.medium_after)
+        medium = surface.medium_after
+        if is_implant:
+            half_height_mm = IMPLANT_HALF_HEIGHT_MM
         line = surface_line_mm(surface, half_height_mm=half_height_mm)
-        axes.plot(line[:, 0], line[:, 1], color="0.2", lw=1.3)
+        color, width = (LENS, 1.8) if is_implant else ("0.2", 1.3)
+        axes.plot(line[:, 0], line[:, 1], color=color, lw=width)
     _draw_retina(axes, eye)
     for sign in (-1.0, 1.0):
         y_mm = sign * np.array([pupil_diameter_mm / 2.0 / 1.13, 5.6])
