@@ -240,6 +240,19 @@ class ImplantBody(Body, kw_only=True):
         ]
         | UnsetType
     ) = UNSET
+    residual_dpt: (
+        Annotated[
+            float,
+            Meta(
+                ge=-10.0,
+                le=10.0,
+                description="spherical equivalent that remains, at the cornea, at 555 "
+                "nm, least squares over 4 mm: the power is solved; instead of the "
+                "power and the radii",
+            ),
+        ]
+        | UnsetType
+    ) = UNSET
     anterior_radius_mm: RadiusMm | UnsetType = UNSET
     posterior_radius_mm: RadiusMm | UnsetType = UNSET
     anterior_conic_constant: ConicConstant = 0.0

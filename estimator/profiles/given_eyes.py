@@ -14,7 +14,7 @@ from typing import Any
 
 import msgspec
 import numpy as np
-from msgspec import UNSET
+from msgspec import UNSET, structs
 from numpy.typing import NDArray
 
 from estimator.corrections.worn_lens import replaces_lens
@@ -23,6 +23,7 @@ from estimator.eye.parameters import EyeParameters
 from estimator.eye.surface_eye import SurfaceModel
 from estimator.note import Note
 from estimator.optics.media import AbbeNumber, Constant
+from estimator.optics.prescription import power_vector_from_zernike
 from estimator.optics.surfaces import (
     EyeSurfaces,
     Retina,
@@ -49,6 +50,11 @@ LABEL_INDEX = 1.336
 
 SMALLEST_GAP_MM = 0.1
 """Distance of the iris from the implant."""
+
+SOLVED_DPT = (20.0, 22.0)
+"""First two powers of an implant that is solved."""
+
+MAX_POWER_STEPS, POWER_TOLERANCE_DPT = 12, 1e-6
 
 HIGHER_ORDERS = range(6, N_TERMS)
 MAX_CORNEA_STEPS = 8
@@ -89,6 +95,58 @@ def pseudophakic_model(
         eye = _with_cornea(eye, cornea_um, body.cornea_pupil_diameter_mm / 2.0)
     _check(eye)
     return SurfaceModel(eye)
+
+
+def solved_power_dpt(body: PseudophakicBody, cornea_um: Numbers | None) -> float:
+    """Return the labeled power with which the residual of a body's implant remains.
+
+    Parameters
+    ----------
+    body : PseudophakicBody
+        With ``implant.residual_dpt``.
+    cornea_um : (28,) or None
+        See `pseudophakic_model`.
+
+    Raises
+    ------
+    ProfileError
+        No power from -15 to 45 dpt leaves this refraction.
+    """
+    residual_dpt = body.implant.residual_dpt
+    assert isinstance(residual_dpt, float)
+
+    def error_dpt(power_dpt: float) -> float:
+        implant = structs.replace(body.implant, power_dpt=power_dpt, residual_dpt=UNSET)
+        solved = pseudophakic_model(structs.replace(body, implant=implant), cornea_um)
+        return refraction_dpt(solved.relaxed) - residual_dpt
+
+    low_dpt, high_dpt = SOLVED_DPT
+    for _ in range(MAX_POWER_STEPS):
+        low, high = error_dpt(low_dpt), error_dpt(high_dpt)
+        if abs(high) < POWER_TOLERANCE_DPT:
+            return high_dpt
+        next_dpt = high_dpt - high * (high_dpt - low_dpt) / (high - low)
+        low_dpt, high_dpt = high_dpt, next_dpt
+        if not -15.0 <= next_dpt <= 45.0:
+            break
+    raise ProfileError(
+        "implant.residual_dpt",
+        f"{residual_dpt:g} needs an implant of another power",
+        "a refraction that an implant of -15 to 45 dpt leaves",
+    )
+
+
+def refraction_dpt(eye: EyeSurfaces) -> float:
+    """Return M at the cornea, 555 nm and `SURFACES_PUPIL_MM`."""
+    from estimator.wavefront.aberrations import on_axis_zernike  # loads slowly
+
+    radius_mm = SURFACES_PUPIL_MM / 2.0
+    zernike_um = on_axis_zernike(
+        pack_eye(eye)[None],
+        media_indices(eye, REFERENCE_WAVELENGTH_NM),
+        zernike_radius_mm=radius_mm,
+    )[0][0]
+    return power_vector_from_zernike(zernike_um, zernike_radius_mm=radius_mm)[0]
 
 
 def _cornea(body: PseudophakicBody) -> tuple[Surface, Surface]:
@@ -152,6 +210,12 @@ def _center_mm(body: PseudophakicBody) -> float:
 
 def _implant(body: ImplantBody, center_mm: float) -> tuple[Surface, Surface]:
     given = body.anterior_radius_mm, body.posterior_radius_mm
+    if body.residual_dpt is not UNSET:
+        raise ProfileError(
+            "implant.residual_dpt",
+            "cannot be combined with power_dpt or radii",
+            "one of the three",
+        )
     if body.power_dpt is not UNSET:
         if given != (UNSET, UNSET):
             raise ProfileError(
@@ -366,8 +430,24 @@ def _pseudophakic(body: given_bodies.PseudophakicBody) -> EyeProfile:
             "0 in sphere_dpt, cylinder_dpt and spherical_aberration_um: the correction "
             "only adds the steps or zones of its design",
         )
+    notes: tuple[Note, ...] = (IMPLANT_NOTE,)
+    implant = body.implant
+    if implant.residual_dpt is not UNSET and implant.power_dpt is UNSET:
+        power_dpt = solved_power_dpt(body, cornea_um)
+        notes += (_power_note(implant.residual_dpt, power_dpt),)
+        implant = structs.replace(implant, power_dpt=power_dpt, residual_dpt=UNSET)
+        body = structs.replace(body, implant=implant)
     profile = _with_surfaces(body, "pseudophakic", pseudophakic_model(body, cornea_um))
-    return replace(profile, notes=(IMPLANT_NOTE, *profile.notes))
+    return replace(profile, notes=(*notes, *profile.notes))
+
+
+def _power_note(residual_dpt: float, power_dpt: float) -> Note:
+    return Note(
+        "implant",
+        f"implant of {power_dpt:.2f} dpt, solved such that a spherical equivalent of "
+        f"{residual_dpt:+.2f} dpt remains at the cornea (555 nm, 4 mm)",
+        power_dpt=power_dpt,
+    )
 
 
 def _with_surfaces(

@@ -10,7 +10,7 @@ from estimator import power_vector_from_zernike, prescription_from_power_vector
 from estimator.estimate.model import eye_model
 from estimator.optics.zernike import index_from_nm
 from estimator.profiles.given_eyes import biconvex_radius_mm
-from estimator.profiles.parse import parse_profile
+from estimator.profiles.parse import ProfileError, parse_profile
 from estimator.wavefront.aberrations import wavefront_aberrations
 from tests.numerical.iol_formulas import FORMULAS
 
@@ -155,3 +155,48 @@ def test_a_diffractive_design_adds_its_foci():
 def test_the_reply_says_that_no_measured_wavefront_is_kept():
     (note,) = parse_profile(EYE).notes
     assert "traced through its implant" in note
+
+
+@pytest.mark.parametrize("residual_dpt", [0.0, -2.5, 1.0])
+@pytest.mark.parametrize(
+    "biometry",
+    [
+        {},
+        {"axial_length_mm": 27.5, "keratometry_dpt": [41, 42.5]}
+        | {"keratometry_axis_deg": 20},
+        {"axial_length_mm": 21.5, "cornea_zernike_um": {"4,0": 0.27}},
+    ],
+    ids=["mean", "long", "short"],
+)
+def test_the_power_is_solved_for_what_shall_remain(biometry, residual_dpt):
+    """By another way to trace: through the pupil of the eye, on another circle."""
+    body = {**EYE, **biometry, "implant": {"residual_dpt": residual_dpt}}
+    profile = parse_profile(body)
+    found = wavefront_aberrations(
+        profile.surfaces.relaxed, wavelength_nm=555.0, pupil_diameter_mm=4.0
+    )
+    m_dpt, _, _ = power_vector_from_zernike(
+        found.zernike_um, zernike_radius_mm=found.zernike_radius_mm
+    )
+    assert m_dpt == pytest.approx(residual_dpt, abs=0.03)
+    (note,) = [n for n in profile.notes if n.code == "implant"]
+    by_power = {**body, "implant": {"power_dpt": note.values["power_dpt"]}}
+    assert parse_profile(by_power).digest == profile.digest
+
+
+@pytest.mark.parametrize(
+    ("implant", "said"),
+    [
+        ({"residual_dpt": 0, "power_dpt": 21}, "cannot be combined with power_dpt"),
+        ({"residual_dpt": 0, "anterior_radius_mm": 9}, "needs|combined"),
+    ],
+)
+def test_a_solved_power_excludes_others(implant, said):
+    with pytest.raises(ProfileError, match=said):
+        parse_profile({**EYE, "implant": implant})
+
+
+def test_a_power_that_no_implant_has_is_refused():
+    body = {**EYE, "axial_length_mm": 17, "implant": {"residual_dpt": -10}}
+    with pytest.raises(ProfileError, match="needs an implant of another power"):
+        parse_profile(body)
