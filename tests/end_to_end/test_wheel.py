@@ -47,6 +47,7 @@ HELD = (
     "clients/assets/*",
     "clients/js/*.js",
     "clients/js/package.json",
+    "clients/scenarios.json",
     "clients/js/README.md",
     "clients/web/*.css",
     "clients/web/*.js",
