@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from clients.commands.options import read_size_px
-from filter_service.command_line import Json, print_json, print_line
+from filter_service.command_line import Json, check_range, print_json, print_line
 from filter_service.progress import Progress
 
 if TYPE_CHECKING:
@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
 PICTURES = ("scene.png", "a.png", "b.png")
 MAP = "defocus.png"
+SIDE_LIMITS_PX = (16, 4096)
 MAP_DPI = 120
 
 
@@ -60,6 +61,8 @@ def scenario(
         return
     chosen = scenario_named(name)
     size_px = read_size_px(size)
+    for side_px in size_px:
+        check_range("--size", side_px, SIDE_LIMITS_PX)
     folder = Path(name) if out is None else out
     folder.mkdir(parents=True, exist_ok=True)
     notes = _write(chosen, folder, size_px, with_map=defocus_map, quiet=json_output)

@@ -47,3 +47,7 @@ def test_an_unknown_scenario_is_refused_with_all_names(tmp_path):
     assert answer.returncode == 2
     assert "expected one of: astigmatism," in answer.stderr
     assert not (tmp_path / "none").exists()
+    answer = run_command("scenario", "reading", "--size", "9000x9000", cwd=tmp_path)
+    assert answer.returncode == 2
+    assert "--size is 9000; allowed: 16 to 4096" in answer.stderr
+    assert not list(tmp_path.iterdir())
