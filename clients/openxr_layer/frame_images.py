@@ -12,9 +12,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from clients.headset.runtime import Eye, EyeView
+from clients.headset.runtime import EYES, Eye, EyeView
 from clients.headset.stereo_gaze import RgbdPicture
 from clients.openxr_layer import wire
+from clients.openxr_layer.quads import Quad, draw_quads, light_of
 from filter_service.shared_memory import Slot
 
 _HALF_OF_BYTE = (np.arange(256) / 255.0).astype(np.float16)
@@ -39,20 +40,31 @@ def check_frame(frame: wire.Frame) -> None:
     if frame.color_format not in _DTYPES:
         raise ValueError(f"color format {frame.color_format}")
     for view in frame.views:
-        width_px, height_px = view.color.width_px, view.color.height_px
-        if (
-            not 1
-            <= min(width_px, height_px)
-            <= max(width_px, height_px)
-            <= wire.MAX_SIDE_PX
-        ):
-            raise ValueError(f"an image of {width_px}x{height_px} px")
+        _check_size(view.color)
         if max(view.depth.width_px, view.depth.height_px) > wire.MAX_SIDE_PX:
             raise ValueError("a depth image is too large")
         if not all(map(math.isfinite, view.pose)):
             raise ValueError("a pose is not finite")
         if not all(-1.5 < angle < 1.5 for angle in view.fov_rad):  # also NaN
             raise ValueError(f"a field of view of {list(view.fov_rad)} rad")
+    for quad in frame.quads:
+        if max(quad.color.width_px, quad.color.height_px) == 0:
+            continue
+        if quad.color_format not in _DTYPES:
+            raise ValueError(f"color format {quad.color_format} of a quad")
+        _check_size(quad.color)
+        if quad.color.width_px * quad.color.height_px > wire.MAX_QUAD_PIXELS:
+            raise ValueError("an image of a quad is too large")
+        if not all(map(math.isfinite, (*quad.pose, *quad.size_m))):
+            raise ValueError("a pose or a size of a quad is not finite")
+        if not min(quad.size_m) > 0.0:
+            raise ValueError(f"a quad of {list(quad.size_m)} m")
+
+
+def _check_size(image: wire.Image) -> None:
+    sides_px = image.width_px, image.height_px
+    if not 1 <= min(sides_px) <= max(sides_px) <= wire.MAX_SIDE_PX:
+        raise ValueError(f"an image of {sides_px[0]}x{sides_px[1]} px")
 
 
 class FrameImages:
@@ -83,6 +95,12 @@ class FrameImages:
                 dtype,
             )
             for view in frame.views
+        ]
+        self._quads = [
+            Quad(quad.pose, tuple(quad.size_m), self._light(memory, quad), eyes)
+            for quad in frame.quads
+            if quad.color.width_px
+            and (eyes := tuple(e for i, e in enumerate(EYES) if quad.eyes >> i & 1))
         ]
         self._depths = [
             memory.array(
@@ -119,7 +137,23 @@ class FrameImages:
             note += f"; everything is {away}"
         left, right, *edges = given.tangents
         view = EyeView(eye, given.pose, (left, right, max(edges), min(edges)))
-        return RgbdPicture(view, color, depth_m), note
+        picture = RgbdPicture(view, color, depth_m)
+        draw_quads(picture, self._quads)
+        return picture, note
+
+    @property
+    def has_quads(self) -> bool:
+        """Whether quads are drawn into the pictures."""
+        return bool(self._quads)
+
+    @staticmethod
+    def _light(memory: Slot, quad: wire.QuadLayer) -> NDArray[np.float32]:
+        raw = memory.array(
+            quad.color.start,
+            (quad.color.height_px, quad.color.width_px, 4),
+            _DTYPES[quad.color_format],
+        )
+        return light_of(raw, quad.color_format, quad.flags)
 
     def _rows(self, index: int) -> slice:
         _, _, up, down = self._frame.views[index].fov_rad

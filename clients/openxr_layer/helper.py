@@ -104,6 +104,14 @@ class LayerOptions(EyeOptions):
     split: Annotated[
         bool, typer.Option("--split", help="Leave the left half unfiltered.")
     ] = False
+    leave_quads: Annotated[
+        bool,
+        typer.Option(
+            "--leave-quads",
+            help="Show quad layers, such as menus, unfiltered.  By default, they are "
+            "filtered at their distance.",
+        ),
+    ] = False
     socket: Socket = None
 
     @property
@@ -281,6 +289,7 @@ class LayerHelper:
         welcome = wire.Welcome(
             *(wire.WELCOME, wire.MAGIC, wire.VERSION),
             *(self._options.wait_ms, self._options.longest_age_ms),
+            self._options.leave_quads,
         )
         self._say(f"{name}: connected")
         self._seeing.restart()
@@ -409,8 +418,10 @@ class LayerHelper:
             self.on_frame(frame, seen)
         if seen is None or seen.frame is not frame:
             return False
+        ratio = SPLIT_RATIO if self._options.split else 0.0
         for index, color in enumerate(seen.colors):
-            ratio = SPLIT_RATIO if self._options.split else 0.0
+            if ratio and images.has_quads:  # they are not in the program's image
+                images.put(index, pictures[index].color)
             images.put(index, cast("NDArray[Any]", color), ratio)  # as the input
         self._look.learn(pictures, eyes, seen.used_focus_dpt)
         took_ms = MS_PER_S * (time.monotonic() - begun_s)

@@ -22,6 +22,8 @@ CONTROL = 100
 
 SRGB8, LINEAR8, LINEAR16F = 1, 2, 3
 HAS_HEAD, HAS_GAZE, IS_BLENDED, TOP_FIRST, IS_BGR = 1, 2, 4, 8, 16
+IS_UNPREMULTIPLIED = 32
+N_QUADS, MAX_QUAD_PIXELS = 4, 1 << 24
 
 MAX_SIDE_PX = 16384
 MAX_SHARED_BYTES = 1 << 30
@@ -43,7 +45,10 @@ class Welcome(ctypes.Structure):
 
     _fields_ = tuple(
         (name, c_uint32)
-        for name in ("kind", "magic", "version", "wait_ms", "max_age_ms")
+        for name in (
+            *("kind", "magic", "version", "wait_ms", "max_age_ms"),
+            "leaves_quads",
+        )
     )
 
 
@@ -83,6 +88,23 @@ class View(ctypes.Structure):
         return left, right, up, down
 
 
+class QuadLayer(ctypes.Structure):
+    """A quad layer above the projection; of width 0 if there is none."""
+
+    _fields_ = (
+        ("position_m", c_float * 3),
+        ("orientation", c_float * 4),
+        ("size_m", c_float * 2),
+        *((name, c_uint32) for name in ("color_format", "flags", "eyes")),
+        ("color", Image),
+    )
+
+    @property
+    def pose(self) -> tuple[float, ...]:
+        """Return position and orientation."""
+        return (*self.position_m, *self.orientation)
+
+
 class Frame(ctypes.Structure):
     """A frame to filter, and what the layer did since the previous one."""
 
@@ -96,6 +118,7 @@ class Frame(ctypes.Structure):
         ("gaze", c_float * 4),
         ("gaze_time_ns", c_int64),
         ("views", View * 2),
+        ("quads", QuadLayer * N_QUADS),
         *(
             (name, c_uint32)
             for name in (

@@ -62,11 +62,11 @@ def moving_head(tmp_path):
     return str(path)
 
 
-def filtered_by_hand(eye, picture):
+def filtered_by_hand(eye, picture, settings=SETTINGS):
     """Return what `EyeFilter` gives for a picture, as bytes of its own encoding."""
     is_srgb = picture.color.dtype == np.uint8
     body = body_of_eye(PROFILES[eye], eye)
-    with EyeFilter(body, picture.camera, SETTINGS) as eye_filter:
+    with EyeFilter(body, picture.camera, settings) as eye_filter:
         view = RgbdView(picture.color, picture.depth_m, picture.view.tangents)
         seen = eye_filter.filter(
             view,

@@ -15,6 +15,7 @@ STRUCTURES = {
     "wire_memory": wire.Memory,
     "wire_image": wire.Image,
     "wire_view": wire.View,
+    "wire_quad": wire.QuadLayer,
     "wire_frame": wire.Frame,
     "wire_result": wire.Result,
 }
@@ -34,6 +35,9 @@ CONSTANTS = {
     "WIRE_IS_BLENDED": wire.IS_BLENDED,
     "WIRE_TOP_FIRST": wire.TOP_FIRST,
     "WIRE_IS_BGR": wire.IS_BGR,
+    "WIRE_IS_UNPREMULTIPLIED": wire.IS_UNPREMULTIPLIED,
+    "WIRE_QUADS": wire.N_QUADS,
+    "WIRE_QUAD_PIXELS": wire.MAX_QUAD_PIXELS,
 }
 
 

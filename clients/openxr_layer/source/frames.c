@@ -5,101 +5,11 @@
 #include "gaze.h"
 #include "graphics.h"
 #include "log.h"
+#include "plan.h"
 
-#define MAX_LAYERS 64
 #define NS_PER_MS UINT64_C(1000000)
 #define MAX_RESULTS 4
 #define ALIGN(bytes) (((bytes) + 63) & ~(size_t)63)
-
-/* The projection layer of a frame that is to be filtered. */
-typedef struct {
-    const XrCompositionLayerProjection *layer;
-    uint32_t index;
-    reference_space space;
-    swapchain *color[WIRE_EYES], *depth[WIRE_EYES]; /* depth: NULL without */
-    const XrCompositionLayerDepthInfoKHR *depth_info[WIRE_EYES];
-} plan;
-
-/* What the application submits --------------------------------------------------------- */
-
-static bool is_inside(const swapchain *chain, const XrSwapchainSubImage *part) {
-    const XrRect2Di *r = &part->imageRect;
-    return r->offset.x >= 0 && r->offset.y >= 0 && r->extent.width > 0 &&
-           r->extent.height > 0 &&
-           (int64_t)r->offset.x + r->extent.width <= chain->info.width &&
-           (int64_t)r->offset.y + r->extent.height <= chain->info.height &&
-           part->imageArrayIndex < chain->info.arraySize;
-}
-
-static bool is_color(const swapchain *chain) { return chain->format && chain->format->wire; }
-
-static bool is_depth(const swapchain *chain) {
-    return chain->format && !chain->format->wire;
-}
-
-static const XrCompositionLayerDepthInfoKHR *depth_of(const void *next) {
-    for (const XrBaseInStructure *at = next; at; at = at->next)
-        if (at->type == XR_TYPE_COMPOSITION_LAYER_DEPTH_INFO_KHR)
-            return (const XrCompositionLayerDepthInfoKHR *)at;
-    return NULL;
-}
-
-/* Find the images of a layer; false if it cannot be filtered. */
-static bool plan_views(session *at, plan *p) {
-    for (int eye = 0; eye < WIRE_EYES; ++eye) {
-        swapchain *color = find_swapchain(p->layer->views[eye].subImage.swapchain);
-        if (!color || color->session != at) return false;
-        p->color[eye] = color;
-        color->unused_releases = 0;
-    }
-    for (int eye = 0; eye < WIRE_EYES; ++eye) {
-        const XrCompositionLayerProjectionView *view = p->layer->views + eye;
-        const swapchain *color = p->color[eye];
-        if (!is_color(color) || color->format != p->color[0]->format) {
-            LOG_ONCE(&at->reported, REASON_FORMAT,
-                     "images of format 0x%llx are not filtered; supported: %s, the same "
-                     "for both eyes",
-                     (long long)color->info.format, at->api->formats);
-            return false;
-        }
-        if (!is_inside(color, &view->subImage)) {
-            LOG_ONCE(&at->reported, REASON_RECTANGLE, "a view extends beyond its image");
-            return false;
-        }
-        if (!color->has_copy) return false;
-        const XrCompositionLayerDepthInfoKHR *info = depth_of(view->next);
-        swapchain *depth = info ? find_swapchain(info->subImage.swapchain) : NULL;
-        if (!depth || depth->session != at) continue;
-        depth->unused_releases = 0;
-        if (!is_depth(depth) || !depth->has_copy ||
-            !is_inside(depth, &info->subImage))
-            continue;
-        p->depth[eye] = depth;
-        p->depth_info[eye] = info;
-    }
-    return true;
-}
-
-/* Find the first projection layer that can be filtered. */
-static bool make_plan(session *at, const XrFrameEndInfo *info, plan *p) {
-    for (uint32_t i = 0; i < info->layerCount && i < MAX_LAYERS; ++i) {
-        const XrCompositionLayerBaseHeader *layer = info->layers[i];
-        if (!layer || layer->type != XR_TYPE_COMPOSITION_LAYER_PROJECTION) continue;
-        *p = (plan){.layer = (const XrCompositionLayerProjection *)layer, .index = i};
-        if (p->layer->viewCount != WIRE_EYES || !p->layer->views) {
-            LOG_ONCE(&at->reported, REASON_VIEWS,
-                     "layers of %u views are not filtered; supported: two",
-                     p->layer->viewCount);
-        } else if (!find_reference_space(layer->space, &p->space) ||
-                   p->space.type == XR_REFERENCE_SPACE_TYPE_VIEW) {
-            LOG_ONCE(&at->reported, REASON_SPACE,
-                     "head-locked and controller-locked layers are not filtered");
-        } else if (plan_views(at, p)) {
-            return true;
-        }
-    }
-    return false;
-}
 
 /* Spaces of the layer's own -------------------------------------------------------------- */
 
@@ -130,24 +40,60 @@ static XrSpace own_space(session *at, const reference_space *kind) {
     return made;
 }
 
-static void locate_head(session *at, const reference_space *kind, XrTime time,
-                        wire_frame *wire) {
+/* Find the pose of a space; false if it is unknown. */
+static bool locate(session *at, XrSpace wanted, XrSpace base, XrTime time, XrPosef *pose) {
+    XrSpaceLocation found = {.type = XR_TYPE_SPACE_LOCATION};
+    const XrSpaceLocationFlags needed = XR_SPACE_LOCATION_ORIENTATION_VALID_BIT |
+                                        XR_SPACE_LOCATION_POSITION_VALID_BIT;
+    if (!wanted || !base ||
+        XR_FAILED(at->instance->LocateSpace(wanted, base, time, &found)) ||
+        (found.locationFlags & needed) != needed)
+        return false;
+    *pose = found.pose;
+    return true;
+}
+
+static void locate_head(session *at, XrSpace base, XrTime time, wire_frame *wire) {
+    XrPosef pose;
     if (!at->view_space) {
         const reference_space view = {XR_REFERENCE_SPACE_TYPE_VIEW,
                                       {.orientation.w = 1.0f}};
         at->view_space = create_space(at, &view);
     }
-    XrSpace base = own_space(at, kind);
-    XrSpaceLocation found = {.type = XR_TYPE_SPACE_LOCATION};
-    const XrSpaceLocationFlags needed = XR_SPACE_LOCATION_ORIENTATION_VALID_BIT |
-                                        XR_SPACE_LOCATION_POSITION_VALID_BIT;
-    if (!at->view_space || !base ||
-        XR_FAILED(at->instance->LocateSpace(at->view_space, base, time, &found)) ||
-        (found.locationFlags & needed) != needed)
-        return;
-    memcpy(wire->head, &found.pose.position, sizeof found.pose.position);
-    memcpy(wire->head + 3, &found.pose.orientation, sizeof found.pose.orientation);
+    if (!locate(at, at->view_space, base, time, &pose)) return;
+    memcpy(wire->head, &pose.position, sizeof pose.position);
+    memcpy(wire->head + 3, &pose.orientation, sizeof pose.orientation);
     wire->flags |= WIRE_HAS_HEAD;
+}
+
+/* Rotate a vector by a unit quaternion. */
+static XrVector3f rotated(XrQuaternionf q, XrVector3f v) {
+    XrVector3f t = {2 * (q.y * v.z - q.z * v.y), 2 * (q.z * v.x - q.x * v.z),
+                    2 * (q.x * v.y - q.y * v.x)};
+    return (XrVector3f){v.x + q.w * t.x + q.y * t.z - q.z * t.y,
+                        v.y + q.w * t.y + q.z * t.x - q.x * t.z,
+                        v.z + q.w * t.z + q.x * t.y - q.y * t.x};
+}
+
+/* Return a pose, given in a space, in that space's base. */
+static XrPosef composed(const XrPosef *space, const XrPosef *pose) {
+    XrQuaternionf a = space->orientation, b = pose->orientation;
+    XrVector3f moved = rotated(a, pose->position);
+    return (XrPosef){{a.w * b.x + a.x * b.w + a.y * b.z - a.z * b.y,
+                      a.w * b.y - a.x * b.z + a.y * b.w + a.z * b.x,
+                      a.w * b.z + a.x * b.y - a.y * b.x + a.z * b.w,
+                      a.w * b.w - a.x * b.x - a.y * b.y - a.z * b.z},
+                     {space->position.x + moved.x, space->position.y + moved.y,
+                      space->position.z + moved.z}};
+}
+
+/* Find where the quads of a plan are.  From one on that is nowhere, they are left. */
+static void locate_quads(session *at, plan *p, XrSpace base, XrTime time) {
+    for (unsigned i = 0; i < p->quad_count; ++i) {
+        XrPosef space;
+        if (!locate(at, p->quads[i].layer->space, base, time, &space)) p->quad_count = i;
+        else p->quads[i].pose = composed(&space, &p->quads[i].layer->pose);
+    }
 }
 
 /* To the helper --------------------------------------------------------------------------- */
@@ -158,6 +104,31 @@ static size_t place(wire_image *image, size_t start, const XrSwapchainSubImage *
     image->width_px = (uint32_t)part->imageRect.extent.width;
     image->height_px = (uint32_t)part->imageRect.extent.height;
     return start + ALIGN(pixel_bytes * image->width_px * image->height_px);
+}
+
+static size_t pixel_bytes(const image_format *format) {
+    return format->wire == WIRE_LINEAR16F ? 8 : 4;
+}
+
+static size_t describe_quad(app_frame *frame, unsigned index, const planned_quad *given,
+                            size_t bytes) {
+    const XrCompositionLayerQuad *layer = given->layer;
+    wire_quad *quad = frame->wire.quads + index;
+    frame->quads[index] = layer->subImage;
+    memcpy(quad->position_m, &given->pose.position, sizeof quad->position_m);
+    memcpy(quad->orientation, &given->pose.orientation, sizeof quad->orientation);
+    quad->size_m[0] = layer->size.width;
+    quad->size_m[1] = layer->size.height;
+    quad->color_format = given->chain->format->wire;
+    quad->flags = given->chain->format->flags;
+    if (layer->layerFlags & XR_COMPOSITION_LAYER_BLEND_TEXTURE_SOURCE_ALPHA_BIT)
+        quad->flags |= WIRE_IS_BLENDED;
+    if (layer->layerFlags & XR_COMPOSITION_LAYER_UNPREMULTIPLIED_ALPHA_BIT)
+        quad->flags |= WIRE_IS_UNPREMULTIPLIED;
+    quad->eyes = layer->eyeVisibility == XR_EYE_VISIBILITY_LEFT    ? 1
+                 : layer->eyeVisibility == XR_EYE_VISIBILITY_RIGHT ? 2
+                                                                   : 3;
+    return place(&quad->color, bytes, &layer->subImage, pixel_bytes(given->chain->format));
 }
 
 /* Describe a frame; return the bytes of its images. */
@@ -176,14 +147,14 @@ static size_t describe(session *at, const plan *p, const XrFrameEndInfo *info) {
                          .color_format = format->wire};
     if (frame->flags & XR_COMPOSITION_LAYER_BLEND_TEXTURE_SOURCE_ALPHA_BIT)
         wire->flags |= WIRE_IS_BLENDED;
-    size_t bytes = 0, pixel = wire->color_format == WIRE_LINEAR16F ? 8 : 4;
+    size_t bytes = 0;
     for (int eye = 0; eye < WIRE_EYES; ++eye) {
         const XrCompositionLayerProjectionView *given = p->layer->views + eye;
         wire_view *view = wire->views + eye;
         memcpy(view->position_m, &given->pose.position, sizeof view->position_m);
         memcpy(view->orientation, &given->pose.orientation, sizeof view->orientation);
         memcpy(view->fov_rad, &given->fov, sizeof view->fov_rad);
-        bytes = place(&view->color, bytes, &given->subImage, pixel);
+        bytes = place(&view->color, bytes, &given->subImage, pixel_bytes(format));
     }
     for (int eye = 0; eye < WIRE_EYES; ++eye) {
         const XrCompositionLayerDepthInfoKHR *depth = p->depth_info[eye];
@@ -195,26 +166,30 @@ static size_t describe(session *at, const plan *p, const XrFrameEndInfo *info) {
         view->near_m = depth->nearZ;
         view->far_m = depth->farZ;
     }
+    for (unsigned i = 0; i < p->quad_count; ++i)
+        bytes = describe_quad(frame, i, p->quads + i, bytes);
     return bytes;
 }
 
 /* Begin a frame for the helper; false if it is busy or there is no memory. */
-static bool begin_frame(session *at, const plan *p, const XrFrameEndInfo *info) {
+static bool begin_frame(session *at, plan *p, const XrFrameEndInfo *info) {
     if (at->frame.state != FRAME_NONE) return false;
+    XrSpace base = own_space(at, &p->space);
+    locate_quads(at, p, base, info->displayTime);
     size_t bytes = describe(at, p, info);
     if (!link_share(&at->link, bytes)) {
         if (at->link.is_accepted)
             LOG_ONCE(&at->reported, REASON_MEMORY, "no shared memory for %zu bytes", bytes);
         return false;
     }
-    locate_head(at, &p->space, info->displayTime, &at->frame.wire);
+    locate_head(at, base, info->displayTime, &at->frame.wire);
     gaze_locate(at, info->displayTime, &at->frame.wire);
     return true;
 }
 
 /* Begin to read the copies of a frame. */
 static read_state read_images(session *at, const plan *p) {
-    image_read reads[2 * WIRE_EYES];
+    image_read reads[2 * WIRE_EYES + WIRE_QUADS];
     size_t count = 0;
     for (int eye = 0; eye < WIRE_EYES; ++eye) {
         const wire_view *view = at->frame.wire.views + eye;
@@ -224,6 +199,9 @@ static read_state read_images(session *at, const plan *p) {
             reads[count++] = (image_read){p->depth[eye], &p->depth_info[eye]->subImage,
                                           view->depth.start};
     }
+    for (unsigned i = 0; i < p->quad_count; ++i)
+        reads[count++] = (image_read){p->quads[i].chain, &p->quads[i].layer->subImage,
+                                      at->frame.wire.quads[i].color.start};
     return at->api->begin_read(at, reads, count);
 }
 
@@ -373,11 +351,12 @@ static const XrCompositionLayerBaseHeader *without_depth(session *at, const void
 }
 
 static XrResult pass_on(session *at, const XrFrameEndInfo *info,
-                        const XrCompositionLayerBaseHeader **layers) {
+                        const XrCompositionLayerBaseHeader **layers, uint32_t count) {
     XrFrameEndInfo mine = *info;
     mine.layers = layers;
+    mine.layerCount = count;
     bool is_owned[MAX_LAYERS] = {false};
-    for (uint32_t i = 0; at->instance->is_depth_stripped && i < info->layerCount; ++i) {
+    for (uint32_t i = 0; at->instance->is_depth_stripped && i < count; ++i) {
         const XrCompositionLayerProjection *layer = (const void *)layers[i];
         if (!layer || layer->type != XR_TYPE_COMPOSITION_LAYER_PROJECTION || !layer->views)
             continue;
@@ -385,13 +364,13 @@ static XrResult pass_on(session *at, const XrFrameEndInfo *info,
         is_owned[i] = (const void *)layers[i] != layer;
     }
     XrResult result = at->instance->EndFrame(at->handle, &mine);
-    for (uint32_t i = 0; i < info->layerCount; ++i)
+    for (uint32_t i = 0; i < count; ++i)
         if (is_owned[i]) free((void *)(uintptr_t)layers[i]);
     return result;
 }
 
 /* Exchange frames with the helper; return the space of a frame to show, or none. */
-static XrSpace exchange(session *at, const plan *p, const XrFrameEndInfo *info) {
+static XrSpace exchange(session *at, plan *p, const XrFrameEndInfo *info) {
     ++at->frames;
     take_result(at); /* first, so that the helper gets this frame */
     if (begin_frame(at, p, info)) {
@@ -404,12 +383,37 @@ static XrSpace exchange(session *at, const plan *p, const XrFrameEndInfo *info) 
     return own_space(at, &at->shown.space);
 }
 
+/* Whether the frame that is shown contains a layer. */
+static bool is_in_shown(const session *at, const XrCompositionLayerBaseHeader *layer) {
+    if (!layer || layer->type != XR_TYPE_COMPOSITION_LAYER_QUAD) return false;
+    const XrSwapchainSubImage *part = &((const XrCompositionLayerQuad *)layer)->subImage;
+    for (int i = 0; i < WIRE_QUADS; ++i) {
+        const XrSwapchainSubImage *own = at->shown.quads + i;
+        if (own->swapchain && own->swapchain == part->swapchain &&
+            own->imageArrayIndex == part->imageArrayIndex &&
+            own->imageRect.offset.x == part->imageRect.offset.x &&
+            own->imageRect.offset.y == part->imageRect.offset.y)
+            return true;
+    }
+    return false;
+}
+
+/* Remove the quads that are in the frame that is shown; return how many layers remain. */
+static uint32_t without_quads(const session *at, const plan *p, uint32_t count,
+                              const XrCompositionLayerBaseHeader **layers) {
+    uint32_t kept = p->index + 1;
+    for (uint32_t i = p->index + 1; i < count; ++i)
+        if (!is_in_shown(at, layers[i])) layers[kept++] = layers[i];
+    return kept;
+}
+
 XrResult frames_end(session *at, const XrFrameEndInfo *info) {
     if (!info->layers || info->layerCount > MAX_LAYERS)
         return at->instance->EndFrame(at->handle, info);
     const XrCompositionLayerBaseHeader *layers[MAX_LAYERS];
-    for (uint32_t i = 0; i < info->layerCount; ++i) layers[i] = info->layers[i];
-    if (!at->api) return pass_on(at, info, layers);
+    uint32_t count = info->layerCount;
+    for (uint32_t i = 0; i < count; ++i) layers[i] = info->layers[i];
+    if (!at->api) return pass_on(at, info, layers, count);
     substitute made;
     plan p;
     pthread_mutex_lock(&at->lock);
@@ -427,11 +431,12 @@ XrResult frames_end(session *at, const XrFrameEndInfo *info) {
             ++at->frames_filtered;
             set_substitute(at, &p, base, &made);
             layers[p.index] = (const XrCompositionLayerBaseHeader *)&made.layer;
+            count = without_quads(at, &p, count, layers);
         }
         at->other_ns += now_ns() - begun_ns - at->inside_ns;
     }
     pthread_mutex_unlock(&at->lock);
-    return pass_on(at, info, layers);
+    return pass_on(at, info, layers, count);
 }
 
 void frames_close(session *at) {

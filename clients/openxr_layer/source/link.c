@@ -125,6 +125,7 @@ static void welcome(link_state *link, const wire_welcome *message) {
     link->is_accepted = true;
     link->wait_ms = message->wait_ms < MAX_WAIT_MS ? message->wait_ms : MAX_WAIT_MS;
     link->max_age_ms = message->max_age_ms;
+    link->leaves_quads = message->leaves_quads;
     LOG("connected to the helper");
 }
 

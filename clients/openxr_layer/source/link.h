@@ -15,6 +15,7 @@ typedef struct {
     uint64_t retry_ns;      /* when to try again */
     char application[128], engine[128];
     uint32_t wait_ms, max_age_ms;
+    bool leaves_quads;
     uint8_t *memory;        /* NULL without */
     size_t memory_bytes;
     uint64_t retry_memory_ns;

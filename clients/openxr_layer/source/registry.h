@@ -99,6 +99,7 @@ typedef struct {
     reference_space space;
     XrCompositionLayerFlags flags;
     int64_t format;        /* of the color images */
+    XrSwapchainSubImage quads[WIRE_QUADS]; /* those that it contains; NULL: none */
     wire_frame wire;
 } app_frame;
 

@@ -14,6 +14,8 @@
 #define WIRE_MAGIC 0x4f435558u /* "OCUX" */
 #define WIRE_VERSION 2u
 #define WIRE_EYES 2
+#define WIRE_QUADS 4
+#define WIRE_QUAD_PIXELS (1 << 24) /* of the largest one */
 
 enum { WIRE_HELLO = 1, WIRE_WELCOME, WIRE_MEMORY, WIRE_FRAME, WIRE_RESULT };
 
@@ -29,7 +31,8 @@ enum {
     WIRE_HAS_GAZE = 2,
     WIRE_IS_BLENDED = 4, /* the layer below shows through the alpha channel */
     WIRE_TOP_FIRST = 8,  /* rows begin at the top; otherwise at the bottom, as in OpenGL */
-    WIRE_IS_BGR = 16     /* channels are BGRA; otherwise RGBA */
+    WIRE_IS_BGR = 16,    /* channels are BGRA; otherwise RGBA */
+    WIRE_IS_UNPREMULTIPLIED = 32 /* alpha is not in the color; only of quads */
 };
 
 typedef struct {
@@ -41,6 +44,7 @@ typedef struct {
     uint32_t kind, magic, version;
     uint32_t wait_ms;     /* longest wait for the result of a frame */
     uint32_t max_age_ms;  /* of a filtered frame that is shown again */
+    uint32_t leaves_quads; /* quads are shown unfiltered */
 } wire_welcome;
 
 typedef struct {
@@ -60,6 +64,15 @@ typedef struct {
     wire_image color, depth;             /* depth: float32, 0 to 1; width 0 without */
 } wire_view;
 
+/* A quad layer above the projection. */
+typedef struct {
+    float position_m[3], orientation[4]; /* in the space of the views' poses */
+    float size_m[2];
+    uint32_t color_format, flags; /* of frames, IS_BLENDED or IS_UNPREMULTIPLIED */
+    uint32_t eyes;                /* 1: left, 2: right, 3: both */
+    wire_image color;             /* width 0: no quad */
+} wire_quad;
+
 typedef struct {
     uint32_t kind, flags;
     uint64_t frame_id;
@@ -69,6 +82,7 @@ typedef struct {
     float gaze[4];        /* orientation within the head; -z points ahead */
     int64_t gaze_time_ns; /* 0: unknown */
     wire_view views[WIRE_EYES];
+    wire_quad quads[WIRE_QUADS]; /* the lowest first */
     /* since the previous FRAME: frames that the application submitted, those shown
      * filtered, those shown unfiltered after the first filtered one, and the time that
      * the layer took on the application's threads */

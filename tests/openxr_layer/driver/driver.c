@@ -14,6 +14,10 @@ static const struct plan CASES[] = {
     {"two-layers", "a second projection, blended by its alpha", .projections = 2},
     {"quad-below", "a quad under the projection", .quad = -1},
     {"quad-above", "a quad over the projection", .quad = 1},
+    {"quad-locked", "a quad in a VIEW space over the projection", .quad = 1,
+     .is_quad_locked = true},
+    {"quad-alpha", "a quad over the projection, blended by its alpha", .quad = 1,
+     .has_quad_alpha = true},
     {"view-locked", "the projection is in a VIEW space", .is_view_locked = true},
     {"action-space", "the projection is in a space of an action",
      .in_action_space = true},
@@ -397,10 +401,13 @@ static void describe_layers(struct session *session, struct layers *layers) {
     memset(layers, 0, sizeof *layers);
     layers->quad = (XrCompositionLayerQuad){
         .type = XR_TYPE_COMPOSITION_LAYER_QUAD,
-        .space = session->layer_space,
+        .space = plan->is_quad_locked ? session->view_space : session->layer_space,
         .pose = {{0, 0, 0, 1}, {0, 0, -1}},
         .size = {0.3f, 0.3f},
     };
+    if (plan->has_quad_alpha)
+        layers->quad.layerFlags = XR_COMPOSITION_LAYER_BLEND_TEXTURE_SOURCE_ALPHA_BIT |
+                                  XR_COMPOSITION_LAYER_UNPREMULTIPLIED_ALPHA_BIT;
     if (plan->quad)
         layers->quad.subImage = part_of(&plain, &session->quad.color[0], 0, 0);
     const void *quad = &layers->quad;
@@ -806,6 +813,7 @@ static void furnish(struct session *session) {
     if (plan->quad) {
         session->quad.chain_count = session->quad.view_count = 1;
         session->quad.first_view = 2;
+        session->quad.has_alpha = plan->has_quad_alpha;
         make_chain(session, &session->quad.color[0], options.color_format, QUAD_PX,
                    QUAD_PX, 1, 1);
     }

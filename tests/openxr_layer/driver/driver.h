@@ -67,7 +67,7 @@ struct plan {
     bool is_view_locked, in_action_space, renews_space, other_thread, no_context;
     bool ends_from_thread, second, violates;
     bool is_growing, is_hidden, other_context, acquires_ahead, forks;
-    bool loses_device, breaks_layout;
+    bool loses_device, breaks_layout, is_quad_locked, has_quad_alpha;
     uint32_t samples;
     int release_every;               /* frames; -1: only the first one */
     int sessions, projections, quad; /* quad: -1 below, 1 above the projection */
