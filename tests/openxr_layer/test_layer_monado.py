@@ -15,6 +15,7 @@ import pytest
 from clients.openxr_layer.program import LIBRARY_VARIABLE
 from tests.headset.monado import Monado
 from tests.headset.rooms import stripes
+from tests.openxr_layer.programs import VALIDATION
 
 N_FRAMES = 300
 TIMEOUT_S = 120
@@ -78,8 +79,11 @@ class Run:
         """End it; return its exit code and its report."""
         self.process.send_signal(number)
         output, _ = self.process.communicate(timeout=TIMEOUT_S)
-        lines = [line for line in output.splitlines() if line.startswith("{")]
-        return self.process.returncode, json.loads(lines[-1])
+        # It may follow a line that the program did not end.
+        report = output.splitlines()[-1]
+        return self.process.returncode, json.loads(
+            report[report.index('{"filtered"') :]
+        )
 
 
 @pytest.fixture
@@ -139,6 +143,29 @@ def test_hello_xr_under_validation(run, display, tmp_path):
     assert [line for line in wrong if "VALID_DEBUG" not in line] == []
     # The layer's own swapchains and spaces are in the dump, below the layer.
     assert len(re.findall("XrResult xrCreateSwapchain", dump.read_text())) == 4
+
+
+@needs_hello_xr
+def test_hello_xr_with_vulkan(run, tmp_path):
+    # Vulkan without the 2 asks for VK_KHR_external_semaphore_fd, which lavapipe has
+    # only where there is /dev/udmabuf.
+    hello = ("hello_xr", "-g", "Vulkan2")
+    variables = {
+        "VK_INSTANCE_LAYERS": "VK_LAYER_KHRONOS_validation",
+        "VK_KHRONOS_VALIDATION_VALIDATE_SYNC": "1",
+    }
+    with Monado(tmp_path, screen=True, variables=HALF_SIZE) as monado:
+        with run(monado, *EYES, *PATIENT, "--", *hello, **variables) as program:
+            program.wait_until(lambda said: said.count("eye: ready") == 2)
+            time.sleep(2.0)
+            picture = monado.screenshot()
+            code, report = program.report()
+            said = program.said
+    assert code in (0, 128 + signal.SIGINT)
+    assert report["shown_filtered"] >= 20
+    assert report["fallback"] == 0
+    assert np.mean(picture.max(axis=2) > 20) > 0.9, "black"
+    assert [line for line in said.splitlines() if VALIDATION.search(line)] == []
 
 
 @needs_hello_xr

@@ -70,15 +70,14 @@ class Application:
         return shutil.which(self.program) is None
 
 
-def _qt(integration: str) -> Application:
+def _qt(name: str, backend: str = "opengl") -> Application:
     variables = {
-        "QSG_RHI_BACKEND": "opengl",
+        "QSG_RHI_BACKEND": backend,
         "QT_QPA_PLATFORM": "xcb",
-        "QT_XCB_GL_INTEGRATION": f"xcb_{integration}",
+        "QT_XCB_GL_INTEGRATION": "xcb_egl" if name == "egl" else "xcb_glx",
         "QML_XHR_ALLOW_FILE_READ": "1",
     }
-    name = f"qt-{integration}"
-    return Application(name, QML, (), "scene.qml", variables, has_depth=True)
+    return Application(f"qt-{name}", QML, (), "scene.qml", variables, has_depth=True)
 
 
 def _psychtoolbox(name: str, keywords: str) -> Application:
@@ -95,6 +94,7 @@ def _psychtoolbox(name: str, keywords: str) -> Application:
 APPLICATIONS = (
     _qt("glx"),
     _qt("egl"),
+    _qt("vulkan", "vulkan"),
     _psychtoolbox("untimed", "NoTimingSupport NoTimestampingSupport"),
     _psychtoolbox("usual", " "),
     _psychtoolbox("presenter-thread", "TimingSupport TimestampingSupport"),
