@@ -109,6 +109,7 @@ def examine() -> dict[str, Any]:
         check_packages("window packages", WINDOW_PACKAGES, packages),
         check_packages("pyrender packages", PYRENDER_PACKAGES, packages),
         check_display(),
+        check_layer(),
     ]
     works = what_works({check.name: check.ok for check in checks})
     return {
@@ -314,6 +315,16 @@ def check_display() -> Check:
     return Check("display", False, "no display", f"{APT_INSTALL} xvfb")
 
 
+def check_layer() -> Check:
+    """Report whether the OpenXR layer was built."""
+    from clients.openxr_layer.program import NoLayer, library
+
+    try:
+        return Check("layer", True, f"for OpenGL and Vulkan: {library()}")
+    except NoLayer as error:
+        return Check("layer", False, str(error))
+
+
 def what_works(ok: dict[str, bool]) -> dict[str, bool]:
     """Return for each purpose whether it works, from the checks that it requires."""
     filters = ok["python"] and ok["service packages"] and ok["native"]
@@ -325,6 +336,7 @@ def what_works(ok: dict[str, bool]) -> dict[str, bool]:
         "demo": demo,
         "pyrender": filters and ok["pyrender packages"] and ok["gl"],
         "window": demo and ok["window packages"] and ok["display"],
+        "layer": filters and ok["layer"],
     }
 
 

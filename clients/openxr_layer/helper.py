@@ -152,6 +152,7 @@ class _Program:
     connection: socket.socket
     name: str
     engine: str
+    graphics: str
     memory: Slot | None = None
     notes: set[str] = field(default_factory=set)
 
@@ -279,13 +280,14 @@ class LayerHelper:
         if hello.version != wire.VERSION:
             self._say(f"{name}: its layer is of another version of ocufilter")
         elif self._program is None:
-            self._begin(connection, name, _printable(hello.engine))
+            self._begin(connection, name, hello)
             return
         self._forget(connection)  # it tries again every second
 
-    def _begin(self, connection: socket.socket, name: str, engine: str) -> None:
+    def _begin(self, connection: socket.socket, name: str, hello: wire.Hello) -> None:
         self._waiting.pop(connection, None)
-        self._program = _Program(connection, name, engine)
+        engine, graphics = _printable(hello.engine), _printable(hello.graphics)
+        self._program = _Program(connection, name, engine, graphics)
         welcome = wire.Welcome(
             *(wire.WELCOME, wire.MAGIC, wire.VERSION),
             *(self._options.wait_ms, self._options.longest_age_ms),
@@ -318,6 +320,7 @@ class LayerHelper:
             return {"error": str(error)}
         return {
             "program": self._program.name if self._program else None,
+            "graphics": self._program.graphics if self._program else None,
             **self.report(),
         }
 

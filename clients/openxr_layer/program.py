@@ -315,7 +315,8 @@ def status(socket: Socket = None, json_output: Json = False) -> None:
         print_line(f"installed: {', '.join(found['installed']) or 'no'}")
         print_line(f"helper: {'none' if helper is None else 'running'} at {socket}")
         if helper is not None:
-            print_line(f"program: {helper['program'] or 'none'}")
+            graphics = f", {helper['graphics']}" if helper["graphics"] else ""
+            print_line(f"program: {helper['program'] or 'none'}{graphics}")
             print_line(f"frames filtered: {helper['filtered']}")
     if not found["layer"]:
         raise typer.Exit(EXIT_FAILURE)

@@ -37,6 +37,7 @@ class Hello(ctypes.Structure):
         *((name, c_uint32) for name in ("kind", "magic", "version", "process_id")),
         ("application", c_char * 128),
         ("engine", c_char * 128),
+        ("graphics", c_char * 16),
     )
 
 

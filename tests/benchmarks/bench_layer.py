@@ -5,9 +5,10 @@ r"""What the OpenXR layer adds to a program's frames, and how old filtered frame
         > tests/benchmarks/results/layer.json
 
 The application of tests/openxr_layer on its mock runtime, at 72 frames a second, with
-depth, in OpenGL by Mesa on the processor: without the layer; with the layer but no
-helper; with a helper that takes every frame and filters none, at once; and with one
-that filters through a myope's left and a keratoconic right eye, on the same cores.
+depth, in OpenGL and in Vulkan by Mesa on the processor: without the layer; with the
+layer but no helper; with a helper that takes every frame and filters none, at once; and
+with one that filters through a myope's left and a keratoconic right eye, on the same
+cores.
 
 ``release + end`` is the time of all calls that release an image or end a frame, of both
 views, whatever they wait for; the runtime waits in them for the application's drawing.
@@ -39,6 +40,7 @@ from tests.openxr_layer import build
 from tests.openxr_layer.layered import layer_environment
 from tests.openxr_layer.programs import Run
 
+APIS = {"OpenGL": (), "Vulkan": ("--vulkan", "2")}
 SIZES_PX = ((448, 504), (896, 1007))
 QUICK_SIZES_PX = ((112, 126),)
 RATE_HZ = 72
@@ -63,10 +65,12 @@ class Unprepared:
 
 
 class Bench:
-    """The application with and without the layer, at one size."""
+    """The application with and without the layer, at one size, in one API."""
 
-    def __init__(self, folder: Path, size_px: tuple[int, int], n_frames: int) -> None:
-        self._folder, self._n_frames = folder, n_frames
+    def __init__(
+        self, folder: Path, api: str, size_px: tuple[int, int], n_frames: int
+    ) -> None:
+        self._folder, self._api, self._n_frames = folder, api, n_frames
         self._socket = folder / "layer.sock"
         self._runtime = build.build_runtime(folder)
         self._driver = build.build_driver(folder)
@@ -74,7 +78,7 @@ class Bench:
             build.build_layer(folder), folder, self._socket
         )
         self._size = "{}x{}".format(*size_px)
-        self.case = f"2 x {self._size}"
+        self.case = f"{api}, 2 x {self._size}"
         head = folder / "head.txt"
         places = (f"{1e-4 * i} 0 0 0 0 0 1" for i in range(n_frames + 100))
         head.write_text("\n".join(places))
@@ -89,6 +93,7 @@ class Bench:
         """Run the application; return it when it has ended."""
         own = self._layered if is_layered else {}
         options = ("plain", "--frames", self._n_frames, "--size", self._size)
+        options += APIS[self._api]
         ran = Run(
             self._runtime,
             self._folder,
@@ -180,10 +185,10 @@ def stage_rows(bench, method, told, names, error=float("inf")) -> list[Row]:
     return rows
 
 
-def measure(size_px: tuple[int, int], n_frames: int) -> list[Row]:
-    """Return the rows of one size."""
+def measure(api: str, size_px: tuple[int, int], n_frames: int) -> list[Row]:
+    """Return the rows of one size, in one API."""
     with tempfile.TemporaryDirectory() as folder:
-        bench = Bench(Path(folder), size_px, n_frames)
+        bench = Bench(Path(folder), api, size_px, n_frames)
         settled = slice(int(SETTLED * n_frames), None)
         plain = call_times_ms(bench.run(is_layered=False))[settled]
         idle = call_times_ms(bench.run(is_layered=True))[settled]
@@ -219,7 +224,12 @@ def main() -> None:
     arguments = parser.parse_args()
     sizes_px = QUICK_SIZES_PX if arguments.quick else SIZES_PX
     n_frames = QUICK_FRAMES if arguments.quick else N_FRAMES
-    rows = [row for size_px in sizes_px for row in measure(size_px, n_frames)]
+    rows = [
+        row
+        for size_px in sizes_px
+        for api in APIS
+        for row in measure(api, size_px, n_frames)
+    ]
     print(json.dumps(report(rows), indent=1))
 
 

@@ -7,11 +7,13 @@ import pytest
 from clients.commands import doctor
 from clients.commands.doctor import (
     check_engine,
+    check_layer,
     check_native,
     check_packages,
     check_shaders,
 )
 from clients.commands.doctor_probes import probe_native, probe_shaders
+from clients.openxr_layer.program import LIBRARY_VARIABLE
 from filter_service.gl import passes as gl_passes
 from filter_service.gl.passes import Passes
 from filter_service.native import library
@@ -77,7 +79,7 @@ def test_without_opengl_shaders_are_not_tried():
 
 CHECKS = (
     *("python", "service packages", "gl", "compute", "shaders", "native"),
-    *("client packages", "window packages", "pyrender packages", "display"),
+    *("client packages", "window packages", "pyrender packages", "display", "layer"),
 )
 
 
@@ -95,6 +97,17 @@ def test_filter_and_serve_need_the_compiled_libraries_and_no_opengl(lost):
     assert works["serve"]
     assert works["demo"] == (lost != "gl")  # its scenes are rendered with OpenGL
     assert not any(doctor.what_works(ok | {"native": False}).values())
+
+
+def test_a_layer_that_was_not_built(monkeypatch):
+    monkeypatch.setenv(LIBRARY_VARIABLE, "none")
+    check = check_layer()
+    assert not check.ok
+    assert "libvulkan-dev" in check.detail
+    ok = dict.fromkeys(CHECKS, True) | {check.name: check.ok}
+    assert [name for name, works in doctor.what_works(ok).items() if not works] == [
+        "layer"
+    ]
 
 
 def test_the_native_engine_s_probe_filters_a_perfect_eye():

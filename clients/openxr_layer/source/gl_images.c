@@ -314,6 +314,7 @@ static bool write_images(session *at, const image_write *writes, size_t count) {
 }
 
 const graphics_api gl_api = {
+    .name = "OpenGL",
     .formats = "SRGB8_ALPHA8, RGBA8, RGB10_A2, RGBA16, RGBA16F",
     .open = open_graphics,
     .close = close_graphics,

@@ -24,6 +24,7 @@ typedef struct {
 typedef enum { READ_FAILED, READ_BEGUN, READ_DONE } read_state;
 
 typedef struct graphics_api {
+    const char *name;
     const char *formats;         /* of color that it can copy, for messages */
     XrSwapchainUsageFlags usage; /* that the application's swapchains get in addition */
 

@@ -80,8 +80,8 @@ static XRAPI_ATTR XrResult XRAPI_CALL layer_CreateSession(XrInstance handle,
     at->handle = *made;
     at->instance = own;
     pthread_mutex_init(&at->lock, NULL);
-    link_init(&at->link, own->application, own->engine);
     const char *reason = open_graphics(at, info);
+    link_init(&at->link, own->application, own->engine, at->api ? at->api->name : "");
     if (reason) LOG("the application's own frames are shown: %s", reason);
     add_session(at);
     return result;

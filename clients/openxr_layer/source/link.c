@@ -18,8 +18,9 @@
 #define MAX_SHARED_BYTES (UINT64_C(1) << 30)
 #define MAX_WAIT_MS 600000u
 
-void link_init(link_state *link, const char *application, const char *engine) {
-    *link = (link_state){.descriptor = -1};
+void link_init(link_state *link, const char *application, const char *engine,
+               const char *graphics) {
+    *link = (link_state){.descriptor = -1, .graphics = graphics};
     strncpy(link->application, application, sizeof link->application - 1);
     strncpy(link->engine, engine, sizeof link->engine - 1);
 }
@@ -108,6 +109,7 @@ void link_connect(link_state *link) {
                         .process_id = (uint32_t)getpid()};
     memcpy(hello.application, link->application, sizeof hello.application);
     memcpy(hello.engine, link->engine, sizeof hello.engine);
+    strncpy(hello.graphics, link->graphics, sizeof hello.graphics - 1);
     if (connect(made, (struct sockaddr *)&address, sizeof address) || !is_trusted(made) ||
         !send_message(made, &hello, sizeof hello, -1)) {
         close(made);

@@ -14,6 +14,7 @@ typedef struct {
     bool is_lost;           /* since the last link_poll */
     uint64_t retry_ns;      /* when to try again */
     char application[128], engine[128];
+    const char *graphics;   /* name of the API */
     uint32_t wait_ms, max_age_ms;
     bool leaves_quads;
     uint8_t *memory;        /* NULL without */
@@ -21,7 +22,8 @@ typedef struct {
     uint64_t retry_memory_ns;
 } link_state;
 
-void link_init(link_state *link, const char *application, const char *engine);
+void link_init(link_state *link, const char *application, const char *engine,
+               const char *graphics);
 
 /* Connect if it is time to; never blocks. */
 void link_connect(link_state *link);

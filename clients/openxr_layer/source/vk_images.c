@@ -297,6 +297,7 @@ static bool write_images(session *at, const image_write *writes, size_t count) {
 }
 
 const graphics_api vk_api = {
+    .name = "Vulkan",
     .formats = "R8G8B8A8 and B8G8R8A8 (SRGB, UNORM), R16G16B16A16_SFLOAT",
     .usage = XR_SWAPCHAIN_USAGE_TRANSFER_SRC_BIT,
     .open = open_graphics,

@@ -37,7 +37,7 @@ enum {
 
 typedef struct {
     uint32_t kind, magic, version, process_id;
-    char application[128], engine[128];
+    char application[128], engine[128], graphics[16];
 } wire_hello;
 
 typedef struct {
