@@ -16,7 +16,7 @@ OFTEN := not clock and not slow and not gpu
 BENCHES := $(filter-out gpu soak witness,$(patsubst tests/benchmarks/bench_%.py,%,$(sort $(wildcard tests/benchmarks/bench_*.py))))
 
 .DEFAULT_GOAL := help
-.PHONY: demo docs web test test-gl test-clients test-tools test-timed test-training test-examples test-batch-ray test-headset test-layer test-layer-applications test-web test-workflows validate witness gl-witness gpu-kit check clean help setup setup-test setup-training setup-examples setup-batch-ray setup-page setup-docs setup-web setup-workflows setup-witness setup-peers peers release release-check setup-release setup-release-check
+.PHONY: demo docs web test test-gl test-clients test-tools test-timed test-training test-examples test-batch-ray test-headset test-layer test-layer-applications test-web test-workflows validate witness gl-witness gpu-kit check clean help setup setup-test setup-test-clients setup-training setup-examples setup-batch-ray setup-page setup-docs setup-web setup-workflows setup-witness setup-peers peers release release-check setup-release setup-release-check
 
 demo: setup  ## filter two scenes through six eyes; writes out/demo/
 	$(PYTHON) -m ocufilter demo $(ARGS)
@@ -33,7 +33,7 @@ test: setup-test  ## run the tests of the product: optics, frames, service, comm
 test-gl: setup-test  ## run the tests of the OpenGL engine at length, on any driver
 	$(PYTEST) -m "$(OFTEN) and gl and not brief" $(PARALLEL) $(TESTS) $(ARGS)
 
-test-clients: setup-test  ## run the tests of the headset, layer, batch, report and examples
+test-clients: setup-test-clients  ## run the tests of the headset, layer, batch, report, examples and C++
 	$(PYTEST) -m "$(OFTEN) and clients" $(PARALLEL) $(TESTS) $(ARGS)
 
 test-tools: setup-test  ## run the tests of benchmarks, scripts of releases and setup, corpus
@@ -129,6 +129,9 @@ setup:  ## create .venv with pinned packages and compile the C libraries
 
 setup-test:
 	@sh setup.sh test
+
+setup-test-clients:
+	@sh setup.sh test-clients
 
 setup-training:
 	@sh setup.sh training

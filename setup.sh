@@ -3,6 +3,7 @@
 #
 #   sh setup.sh            the Python environment in .venv and the system libraries
 #   sh setup.sh test       also a virtual display for the window test, and Node
+#   sh setup.sh test-clients  the same, and the libraries of the C++ client
 #   sh setup.sh training   also the packages for training the networks (torch)
 #   sh setup.sh batch-ray  also a separate environment with Ray
 #   sh setup.sh page       also the packages for `ocufilter web`
@@ -41,6 +42,8 @@ SYSTEM_PACKAGES="libegl1 libgl1 libgl1-mesa-dri"
 REPORT_PACKAGES="libpango-1.0-0 libpangoft2-1.0-0 libharfbuzz-subset0"
 C_PACKAGES="gcc libc6-dev"
 TEST_PACKAGES="xvfb"
+# for the C++ client; MessagePack's headers require those of Boost
+CPP_PACKAGES="g++ cppzmq-dev libmsgpack-cxx-dev"
 NODE_PACKAGES="nodejs npm"
 # for `make witness`; the project itself does not import them
 WITNESS_PACKAGES="mitsuba==3.9.1 numpy"
@@ -127,6 +130,15 @@ install_test_packages() { # optional: the tests also run without them
     missing=$(missing_packages $TEST_PACKAGES)
     if [ -n "$missing" ] && ! apt_install $missing; then
         say "the window test will be skipped because $missing is missing;" \
+            "to install it:  $(install_command "$missing")"
+    fi
+}
+
+install_cpp_packages() { # optional, too
+    command -v dpkg-query >/dev/null || return 0
+    missing=$(missing_packages $CPP_PACKAGES)
+    if [ -n "$missing" ] && ! apt_install $missing; then
+        say "the tests of the C++ client will be skipped because $missing is missing;" \
             "to install it:  $(install_command "$missing")"
     fi
 }
@@ -331,10 +343,12 @@ if [ "$kind" = examples ]; then
 fi
 install_packages
 if [ "$kind" = training ]; then install_training_packages; fi
-if [ "$kind" = test ]; then
+case $kind in test | test-clients)
     install_test_packages
     install_node_packages clients/js "the tests of the JavaScript client"
-fi
+    ;;
+esac
+if [ "$kind" = test-clients ]; then install_cpp_packages; fi
 if [ "$kind" = batch-ray ]; then install_ray; fi
 if [ "$kind" = page ]; then install_page; fi
 if [ "$kind" = docs ]; then install_docs; fi

@@ -17,8 +17,8 @@ from tests.exports import irx3_export, vision_prescription
 from tests.source_tree import ROOT
 
 FOLDERS = (
-    *("", "clients/js", "docs", "examples", "filter_service", "filter_service/native"),
-    *("shaders", "tests", "tests/gpu_kit", "training"),
+    *("", "clients/cpp", "clients/js", "docs", "examples", "filter_service"),
+    *("filter_service/native", "shaders", "tests", "tests/gpu_kit", "training"),
 )
 PAGES = tuple(
     path.relative_to(ROOT).as_posix()

@@ -32,7 +32,8 @@ pytestmark = pytest.mark.clients
 OF_PAGES = [command for page in PAGES for command in commands_of(page)]
 INLINE = r"`((?:ocufilter|python|pip|make|sh|bash|node|npm) [^`]*)`"
 OF_SYSTEM = {
-    *("apt", "apt-get", "cd", "cp", "debootstrap", "env", "git", "install", "ln"),
+    *("apt", "apt-get", "cd", "cp", "debootstrap", "env", "g++", "git", "install"),
+    "ln",
     *("node", "npm", "podman", "runuser", "sha256sum", "source", "sudo", "systemctl"),
     *("useradd", "the-program"),
 }

@@ -45,6 +45,7 @@ HELD = (
     "filter_service/*.schema.json",
     "filter_service/service/ocufilter.service",
     "clients/assets/*",
+    "clients/cpp/*",
     "clients/js/*.js",
     "clients/js/package.json",
     "clients/scenarios.json",
@@ -399,6 +400,7 @@ def test_an_example_runs(installed, path, tmp_path):
     [
         ("docs/how-to/deploy.md", ".config/systemd/user/ocufilter.service"),
         ("clients/js/README.md", "ocufilter-js/filter_client.js"),
+        ("clients/cpp/README.md", "ocufilter-cpp/ocufilter.hpp"),
     ],
 )
 def test_files_of_the_package_are_where_pages_say(installed, page, file, tmp_path):
