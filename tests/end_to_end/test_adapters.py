@@ -3,6 +3,7 @@
 The one for PyTorch is in the tests of the training.
 """
 
+import re
 import runpy
 import sys
 from types import ModuleType, SimpleNamespace
@@ -74,6 +75,26 @@ def test_a_stimulus_shows_what_the_eye_sees(seen_stim, color, tmp_path):
     np.testing.assert_array_equal(again.image, shown[0])
     with pytest.raises(ValueError, match="distance and depth"):
         seen_stim("window", color, "myopia", 10.0)
+
+
+@pytest.mark.clients
+def test_the_lines_of_the_page_show_a_stimulus(seen_stim, color, monkeypatch, tmp_path):
+    page = (ROOT / "docs" / "how-to" / "choose.md").read_text(encoding="utf-8")
+    (lines,) = re.findall(r"```py\n(from psychopy .*?)```", page, re.DOTALL)
+    calls = []
+    visual = sys.modules["psychopy.visual"]
+    sys.modules["psychopy"].visual = visual
+    visual.SeenImageStim = seen_stim
+    visual.Window = lambda: SimpleNamespace(flip=lambda: calls.append("flip"))
+    monkeypatch.setattr(
+        ImageStim, "draw", lambda self: calls.append(self.image), raising=False
+    )
+    monkeypatch.chdir(tmp_path)
+    Image.fromarray(color).save("photo.jpg")
+    exec(lines, {})
+    image, flip = calls
+    assert image.shape == color.shape
+    assert flip == "flip"
 
 
 def test_the_filter_is_imported_with_the_first_stimulus():

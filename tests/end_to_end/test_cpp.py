@@ -542,20 +542,32 @@ def test_the_example_runs_as_its_comment_says(compile_program, real_service, tmp
     assert wrong.stderr.startswith(b"example: kind: ")
 
 
+def fenced(page):
+    (block,) = re.findall(r"```cpp\n(.*?)```", page.read_text("utf-8"), re.DOTALL)
+    return block
+
+
 @pytest.mark.clients
-def test_the_example_of_its_readme_runs(compile_program, real_service, tmp_path):
-    text = (FOLDER / "README.md").read_text(encoding="utf-8")
-    (block,) = re.findall(r"```cpp\n(.*?)```", text, re.DOTALL)
-    include, _, body = block.partition("\n\n")
-    body = body.replace("tcp://127.0.0.1:5577", real_service.endpoint)
-    source = tmp_path / "readme.cpp"
-    source.write_text(
-        f"{include}\n#include <cstdio>\nint main() {{\n"
-        "const std::vector<std::uint8_t> color(480 * 270 * 3, 128);\n"
-        "const std::vector<float> depth_m(480 * 270, 2.0f);\n"
-        f'{body}\nstd::printf("%d", pixels[3 * 480 * 135 + 3 * 240]);\n}}\n'
-    )
+def test_the_lines_of_the_pages_run(compile_program, real_service, tmp_path):
+    include, _, readme = fenced(FOLDER / "README.md").partition("\n\n")
+    way_in = fenced(CHECKOUT / "docs" / "how-to" / "choose.md")
+    text = f"""{include}
+        #include <cstdio>
+        int main() {{
+          const std::vector<std::uint8_t> color(480 * 270 * 3, 128);
+          const std::vector<float> depth_m(480 * 270, 2.0f);
+          {readme}
+          std::printf("%d ", pixels[3 * 480 * 135 + 3 * 240]);
+          {{
+            {way_in}
+            std::printf("%zu", seen.images[0].size_bytes());
+          }}
+        }}"""
+    source = tmp_path / "pages.cpp"
+    source.write_text(text.replace("tcp://127.0.0.1:5577", real_service.endpoint))
     program = compile_program(source, "-O0")
     finished = subprocess.run([program], capture_output=True, timeout=3 * TIMEOUT_S)
     assert finished.returncode == 0, finished.stderr
-    assert abs(int(finished.stdout) - 128) <= 1  # gray stays gray
+    value, size_bytes = map(int, finished.stdout.split())
+    assert abs(value - 128) <= 1  # gray stays gray
+    assert size_bytes == 3 * 480 * 270

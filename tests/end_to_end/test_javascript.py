@@ -106,8 +106,16 @@ def test_the_check_passes_with_profiles_that_the_service_knows(native_service):
 
 @pytest.mark.clients
 @needs_node
-def test_the_example_of_its_readme_runs(native_service, tmp_path):
-    text = (FOLDER / "README.md").read_text(encoding="utf-8")
+@pytest.mark.parametrize(
+    ("page", "printed"),
+    [
+        (FOLDER / "README.md", "320x180, pupil 4 mm"),
+        (CHECKOUT / "docs" / "how-to" / "choose.md", "43200\n"),
+    ],
+    ids=lambda value: getattr(value, "stem", ""),
+)
+def test_the_example_of_a_page_runs(native_service, tmp_path, page, printed):
+    text = page.read_text(encoding="utf-8")
     (example,) = re.findall(r"```js\n(.*?)```", text, re.DOTALL)
     client = (FOLDER / "filter_client.js").as_uri()
     example = example.replace("./filter_client.js", client)
@@ -124,4 +132,4 @@ def test_the_example_of_its_readme_runs(native_service, tmp_path):
         timeout=3 * TIMEOUT_S,
     )
     assert finished.returncode == 0, finished.stderr
-    assert finished.stdout.startswith("320x180, pupil 4 mm")
+    assert finished.stdout.startswith(printed)

@@ -463,3 +463,14 @@ def test_the_examples_of_the_page_run(capsys):
     assert names["x"].grad.abs().sum() > 0.0
     assert abs(names["focus_dpt"].item() - 1.5) > 0.01  # a step of the optimizer
     names["see"].close()
+
+
+def test_the_lines_of_the_page_of_ways_run():
+    text = (ROOT / "docs/how-to/choose.md").read_text(encoding="utf-8")
+    (python, *_) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    (lines,) = re.findall(r"```py\n(import torch.*?)```", text, re.DOTALL)
+    names = {}
+    exec(compile(python, "choose.md", "exec"), names)
+    exec(compile(lines, "choose.md", "exec"), names)
+    assert names["light"].grad.abs().sum() > 0.0
+    names["see"].close()
