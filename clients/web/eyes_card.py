@@ -87,8 +87,6 @@ class EyesCard:
                 props="spread",
                 kind="oc-edited",
             )
-            self._difference = ui.label("").classes("oc-hint oc-difference")
-            self._difference.props("aria-live=polite")
             self._add_slider = add_slider
             self._ages = {AGE: add_slider(AGE)}
             self._age_b = ui.element("div")
@@ -98,6 +96,11 @@ class EyesCard:
                 self._add_panel(name)
             self.problem = problem_label()
             self._show_boxes()
+
+    def build_differences(self) -> None:
+        """Build the list of the entries that differ."""
+        self._difference = ui.label("").classes("oc-note oc-difference")
+        self._difference.props("aria-live=polite")
 
     def _add_panel(self, name: EyeName) -> None:
         """Add the entries of an eye or state, unless they are there."""
@@ -159,7 +162,7 @@ class EyesCard:
         for name, panel in self._panels.items():
             panel.box.set_visibility(name in edited)
             panel.heading.set_visibility(state.shown == "both")
-        for element in (self._tools, self._edited, self._difference):
+        for element in (self._tools, self._edited):
             element.set_visibility(state.is_comparing)
         for number, row in self._ages.items():
             row.set_visibility(state.age(edited[0]) is number)
@@ -184,6 +187,9 @@ class EyesCard:
             panel.show_haze()
             panel.mark(paths if name in self._state.names else ())
         listed = "; ".join(f"{one.label}: {one.a} → {one.b}" for one in found)
-        self._difference.text = (
-            f"From A to B: {listed}" if found else "A and B are the same: change one"
-        )
+        if not self._state.is_comparing:
+            self._difference.text = ""
+        elif found:
+            self._difference.text = f"From A to B: {listed}."
+        else:
+            self._difference.text = "A and B are the same: change one of them."

@@ -174,6 +174,7 @@ class Page:
                     self._picture_card()
                     self._sliders_card()
                     with ui.element("div").classes("oc-told"):
+                        self.eyes.build_differences()
                         self.scenarios.build_text()
                         self._note = ui.label("").classes("oc-note")
                         self._note.props("aria-live=polite")
