@@ -37,6 +37,7 @@ WIDTHS_ARCMIN = {
     "a letter of the 0.5 (20/40) line": 10.0,
     "a letter of the 0.35 (20/57) line": 14.0,
     "a letter of the 0.25 (20/80) line": 20.0,
+    "a letter of the 0.2 (20/100) line": 25.0,
     "the full moon": 31.0,
     "one and a half full moons": 45.0,
     "a little finger at arm's length": 60.0,

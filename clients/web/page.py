@@ -188,7 +188,9 @@ class Page:
         with card("Picture", "oc-picture"):
             with ui.element("div").classes("oc-scene-line"):
                 self.scene = ScenePanel(
-                    state, self._set_picture, self._set_empty, self._mark_rows
+                    *(state, self._set_picture, self._set_empty),
+                    on_notation=self._mark_rows,
+                    on_distance=self._set_distance,
                 )
                 self.scenarios = ScenarioMenu(state, self._start_scenario)
             self.scene.build_uploads()

@@ -17,7 +17,7 @@ from nicegui.element import Element
 from clients.acuity_text import NOTATION_TITLES, Notation, acuity_text
 from clients.scenes.letter_chart import letter_height
 from clients.web.comparison import EyeName
-from clients.web.controls import DISTANCE
+from clients.web.controls import DISTANCE, distance_text
 from clients.web.filter_thread import SentPicture
 from clients.web.page_state import SCENES, PageState
 from clients.web.picture import (
@@ -48,6 +48,17 @@ KINDS = {
     "gltf": "3D file",
 }
 PHOTO_WIDTHS_DEG = {20: "20° wide", 35: "35° wide", 50: "50° wide", 70: "70° wide"}
+PHOTO_DISTANCES = {
+    "": "Choose: all of it is at one distance",
+    "inf": "Landscape, far away",
+    "4": "Room or street, 4 m",
+    "1.5": "Person, 1.5 m",
+    "0.66": "Screen, 66 cm",
+    "0.4": "Page or close-up, 40 cm",
+    "0.2": "Close-up, 20 cm",
+}
+"""Distance of what a photo shows, in meters, and its text."""
+
 NamedFile = tuple[str, bytes]
 
 MAX_AT_ONCE = 2
@@ -84,6 +95,7 @@ class ScenePanel:
     on_picture : called with each new picture
     on_empty : called with a text if the selected scene has no file yet
     on_notation : called when another notation of acuity was chosen
+    on_distance : called with the distance of what a photo shows, in meters
 
     Attributes
     ----------
@@ -95,10 +107,13 @@ class ScenePanel:
         state: PageState,
         on_picture: Callable[[Picture], None],
         on_empty: Callable[[str], None],
+        *,
         on_notation: Callable[[], None],
+        on_distance: Callable[[float], None],
     ) -> None:
         self._state, self._on_picture, self._on_empty = state, on_picture, on_empty
-        self._on_notation = on_notation
+        self._on_notation, self._on_distance = on_notation, on_distance
+        self._photo_distance = ""
         self.kind = SCENES[0]
         self._gltf: Picture | None = None
         self._n_waiting = 0
@@ -152,10 +167,15 @@ class ScenePanel:
                     self._set_width,
                     label="Field of view of the photo",
                 )
-                ui.label(
-                    f"Depth: {DEPTH_HELP}.  Without depth, the whole photo is at one "
-                    "distance."
-                ).classes("oc-hint")
+                self._distances = select(
+                    PHOTO_DISTANCES,
+                    self._photo_distance,
+                    self._set_photo_distance,
+                    label="Distance of what the photo shows",
+                )
+                self._distance_note = ui.label().classes("oc-note oc-ask")
+                self._distance_note.props("aria-live=polite")
+                ui.label(f"Depth: {DEPTH_HELP}.").classes("oc-hint")
                 self._used = ui.label().classes("oc-note")
                 self._show_files()
 
@@ -166,6 +186,20 @@ class ScenePanel:
         if names and self._photo is None:
             text += ". Now upload the photo that this depth belongs to."
         self._used.text = ". Note: ".join((text, *self._notes))
+        is_asked = self._photo is not None and self._depth is None
+        distance = distance_text(self._state.values[DISTANCE.name])
+        self._distance_note.text = (
+            f"The whole photo is shown at {distance}. Choose the distance of what it "
+            "shows: the picture depends on it."
+            if is_asked and not self._photo_distance
+            else ""
+        )
+
+    def _set_photo_distance(self, event: events.ValueChangeEventArguments) -> None:
+        self._photo_distance = event.value
+        if event.value:
+            self._on_distance(float(event.value))
+        self._show_files()
 
     def _set_notation(self, event: events.ValueChangeEventArguments) -> None:
         if event.value != self._state.notation:
@@ -240,6 +274,8 @@ class ScenePanel:
             distance_dpt=self._state.values[DISTANCE.name],
             depth=depth,
         )
+        if self._photo != photo:  # another photo may show something else
+            self._distances.value = ""
         self._photo, self._depth = photo, depth
         self._notes = () if picture is None else picture.notes
         self._show_files()
