@@ -46,7 +46,7 @@ _LABELS = {
     "straylight": "Straylight",
     "yellowing": "Yellowing of the lens",
 }
-_LABEL_HEIGHT_PX, _GAP_PX = 36, 8
+_LABEL_HEIGHT_PX, _GAP_PX = 32, 8
 
 
 class Difference(NamedTuple):
@@ -174,12 +174,15 @@ def joined_png(pictures: Sequence[bytes], labels: Sequence[str]) -> bytes:
             decoded.append(image.convert("RGB"))
     height_px = max(image.height for image in decoded)
     width_px = sum(image.width for image in decoded) + _GAP_PX * (len(decoded) - 1)
-    sheet = Image.new("RGB", (width_px, height_px + _LABEL_HEIGHT_PX), "white")
+    label_px = max(_LABEL_HEIGHT_PX, height_px // 16)
+    sheet = Image.new("RGB", (width_px, height_px + label_px), "white")
     draw, left_px = ImageDraw.Draw(sheet), 0
-    font = ImageFont.load_default(20)
+    font = ImageFont.load_default(0.6 * label_px)
     for picture, label in zip(decoded, labels, strict=True):
         sheet.paste(picture, (left_px, 0))
-        draw.text((left_px + 6, height_px + 6), label, fill="black", font=font)
+        draw.text(
+            (left_px + 6, height_px + label_px // 8), label, fill="black", font=font
+        )
         left_px += picture.width + _GAP_PX
     return png_of(np.asarray(sheet))
 

@@ -255,13 +255,14 @@ class FigurePanel:
         )
         if png is not None:
             self._drawn_request = request
-            self._image.content = _image(png, FIGURE_TITLES[self._figure])
+            kind = "oc-wide-figure" if len(known) > 1 else ""
+            self._image.content = _image(png, FIGURE_TITLES[self._figure], kind)
 
 
-def _image(png: bytes, text: str) -> str:
+def _image(png: bytes, text: str, kind: str = "") -> str:
     """Return the HTML of a picture with its text alternative."""
     data = base64.b64encode(png).decode()
-    return f'<img src="data:image/png;base64,{data}" alt="{text}">'
+    return f'<img src="data:image/png;base64,{data}" alt="{text}" class="{kind}">'
 
 
 def describe_place(facts: dict[str, float]) -> str:

@@ -69,7 +69,9 @@ def help_button(subject: str, text: str) -> ui.button:
         f'flat dense round size=sm aria-label="Help: {subject}"'
     ) as button:
         button.classes("oc-help")
-        with ui.menu().props('max-width="340px"'):
+        with ui.menu().props(
+            f'max-width="340px" role=dialog aria-label="Help: {subject}"'
+        ):
             ui.label(text).classes("oc-help-text")
     return button
 

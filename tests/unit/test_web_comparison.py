@@ -231,7 +231,7 @@ def test_widths_are_compared_in_small_steps():
     ratios = np.divide(sizes[1:], sizes[:-1])
     assert sizes[0] <= 0.5
     assert sizes[-1] >= 1200.0
-    assert ratios.max() <= 1.56  # 20 arcmin to the moon
+    assert ratios.max() <= 1.5
     assert "stroke of a letter of the 0.5" in nearest_familiar_object(1.0)
     assert "0.35" in nearest_familiar_object(8.8 / 2 * 1.5)
 
