@@ -175,7 +175,10 @@ class Header:
         )
         try:
             kind = f"report {file_name}"
-            text = await self._ask(kind, report_html, *bodies, **labels)
+            notation = self._state.notation
+            text = await self._ask(
+                kind, report_html, *bodies, **labels, notation=notation
+            )
         finally:
             waiting.dismiss()
         if text is not None:
