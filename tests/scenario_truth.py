@@ -1,13 +1,13 @@
 """The main figure of each scenario, and an own calculation of it.
 
-Calculations use closed forms, sums over the pupil, or sums over the picture; of the
-profile they take the numbers alone.
+Calculations use closed forms, sums over the pupil, or sums over the picture.  They take
+numbers of the profile and, with an implant, the coefficients of the eye.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -71,6 +71,11 @@ def figures() -> list[Figure]:
             "CIE 135/1-1999 and the stated log s",
         ),
         Figure(
+            *("cataract_monofocal", "refraction after surgery", "dpt"),
+            *(residual_dpt, asked_residual_dpt, 0.02),
+            "what the profile asks for",
+        ),
+        Figure(
             *("cataract_edof", "contrast at 12 cpd and 1 m", "modulation"),
             *(edof_modulation, edof_sum, 0.02),
             "sum over the steps",
@@ -131,7 +136,7 @@ def modulation_sum(
 ) -> float:
     """Modulation of a grating along x: the overlap of two pupils, point by point."""
     shift_mm = NM * 1e-6 * math.degrees(1.0) * cpd
-    x = ((np.arange(600) + 0.5) / 600 - 0.5) * pupil_mm
+    x = ((np.arange(400) + 0.5) / 400 - 0.5) * pupil_mm
     x, y = np.meshgrid(x, x)
     ends = x - shift_mm / 2.0, x + shift_mm / 2.0
     inside = np.all([end**2 + y**2 <= pupil_mm**2 / 4.0 for end in ends], axis=0)
@@ -247,54 +252,83 @@ def cie_log_s() -> float:
 # Implants
 
 
+def residual_dpt() -> float:
+    one = scenarios()["cataract_monofocal"]
+    found = Eye(dict(one.b.profile)).refraction(pupil_diameter_mm=4.0, wavelength_nm=NM)
+    return float(found.values[3])
+
+
+def asked_residual_dpt() -> float:
+    one = scenarios()["cataract_monofocal"]
+    return float(one.b.profile["correction"]["residual_sphere_dpt"])
+
+
+def implant_modulation(name: str, object_dpt: float) -> float:
+    one = scenarios()[name]
+    return modulation_of(
+        one.b.profile, one, object_dpt=object_dpt, focus_dpt=0.0, orientation_deg=0.0
+    )
+
+
+def implant_sum(
+    name: str, object_dpt: float, steps_um: Callable[[NDArray, Mapping], NDArray]
+) -> float:
+    """Sum over the pupil, with the coefficients of the eye and the steps of its lens.
+
+    Coefficients of an eye with rings are those of its distance focus.
+    """
+    one = scenarios()[name]
+    pupil_mm = one.pupil_diameter_mm
+    seen = Eye(dict(one.b.profile)).wavefront(
+        plane="pupil", pupil_diameter_mm=pupil_mm, focus_dpt=0.0, wavelength_nm=NM
+    )
+    terms = [
+        (n, m, float(seen.values[(n * (n + 2) + m) // 2]))
+        for n in range(2, 7)
+        for m in range(-n, n + 1, 2)
+    ]
+    lens = one.b.profile["correction"]
+
+    def wave_um(x, y):
+        square = x**2 + y**2
+        rho, phi = 2.0 * np.sqrt(square) / pupil_mm, np.arctan2(y, x)
+        eye_um = sum(c * zernike(n, m, rho, phi) for n, m, c in terms)
+        # Tilt moves the grating and keeps its contrast.
+        return eye_um + steps_um(square, lens) - object_dpt * square / 2.0
+
+    return modulation_sum(wave_um, pupil_mm, CPD)
+
+
 def edof_modulation() -> float:
-    one = scenarios()["cataract_edof"]
-    return modulation_of(one.b.profile, one, object_dpt=1.0, focus_dpt=0.0)
+    return implant_modulation("cataract_edof", 1.0)
 
 
 def edof_sum() -> float:
     """Steps of one and a half waves, whose first order is the far focus."""
-    one = scenarios()["cataract_edof"]
-    lens = one.b.profile["correction"]
-    add_dpt = lens["add_dpt"] * IMPLANT_POWER_RATIO
-    c40_um = 0.27 + lens["spherical_aberration_um"]
 
-    def wave_um(x, y):
-        square = x**2 + y**2
-        periods = square * add_dpt / 2.0 / 0.55
-        steps_um = 0.55 * (1.5 * (periods % 1.0) - periods)
-        return steps_um + spherical_um(square, c40_um) - 1.0 * square / 2.0
+    def steps_um(square_mm2, lens):
+        add_dpt = lens["add_dpt"] * IMPLANT_POWER_RATIO
+        periods = square_mm2 * add_dpt / 2.0 / 0.55
+        return 0.55 * (1.5 * (periods % 1.0) - periods)
 
-    return modulation_sum(wave_um, one.pupil_diameter_mm, CPD)
+    return implant_sum("cataract_edof", 1.0, steps_um)
 
 
 def trifocal_modulation() -> float:
-    one = scenarios()["cataract_trifocal"]
-    return modulation_of(one.b.profile, one, object_dpt=2.5, focus_dpt=0.0)
+    return implant_modulation("cataract_trifocal", 2.5)
 
 
-def trifocal_um(square_mm2: NDArray) -> NDArray:
-    """Steps of the trifocal implant, as deep as its search for the shares made them."""
-    lens = scenarios()["cataract_trifocal"].b.profile["correction"]
-    rings = load_profile(
-        dict(scenarios()["cataract_trifocal"].b.profile)
-    ).correction.rings
+def trifocal_um(square_mm2: NDArray, lens: Mapping[str, Any]) -> NDArray:
+    """Steps of the trifocal implant, as deep as the search for the shares made them."""
+    eye = {"kind": "prescription", "sphere_dpt": 0, "correction": dict(lens)}
+    depth = np.array(load_profile(eye).correction.rings.kinoform.path_ratio)
     add_dpt = lens["adds_dpt"][0] * IMPLANT_POWER_RATIO
-    depth = np.array(rings.kinoform.path_ratio)
     periods = square_mm2 * add_dpt / 2.0 / 0.55
-    steps_um = 0.55 * depth[(periods % 1.0 * depth.size).astype(int)]
-    c40_um = 0.27 + lens["spherical_aberration_um"]
-    return steps_um + spherical_um(square_mm2, c40_um)
+    return 0.55 * depth[(periods % 1.0 * depth.size).astype(int)]
 
 
 def trifocal_sum() -> float:
-    one = scenarios()["cataract_trifocal"]
-
-    def wave_um(x, y):
-        square = x**2 + y**2
-        return trifocal_um(square) - 2.5 * square / 2.0
-
-    return modulation_sum(wave_um, one.pupil_diameter_mm, CPD)
+    return implant_sum("cataract_trifocal", 2.5, trifocal_um)
 
 
 HALO_ARCMIN = np.arange(12.0, 25.0, 0.2)
@@ -324,7 +358,11 @@ def halo_sum_arcmin() -> float:
     one = scenarios()["night_trifocal"]
     count = 8000
     radius_mm = (np.arange(count) + 0.5) / count * one.pupil_diameter_mm / 2.0
-    field = radius_mm * np.exp(2e3j * np.pi / NM * trifocal_um(radius_mm**2))
+    lens = one.b.profile["correction"]
+    wave_um = trifocal_um(radius_mm**2, lens) + spherical_um(
+        radius_mm**2, 0.27 + lens["spherical_aberration_um"]
+    )
+    field = radius_mm * np.exp(2e3j * np.pi / NM * wave_um)
     angle_mrad = np.radians(HALO_ARCMIN / 60.0) * 1e3
     waves = 2e3 * np.pi / NM * np.outer(angle_mrad, radius_mm)
     return edge_arcmin(np.abs(j0(waves) @ field) ** 2, HALO_ARCMIN)

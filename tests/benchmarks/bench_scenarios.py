@@ -3,8 +3,8 @@
     python -m tests.benchmarks.bench_scenarios [--quick] [--json]
 
 - ``figure``: acuity, contrast, straylight, halo, defocus or refraction of a state, less
-  that of `scenario_truth`, whose calculations take only numbers of the profile.  The
-  time is that of the program's figure.
+  that of `scenario_truth`, whose calculations take numbers of the profile and, with
+  an implant, coefficients of the eye.  The time is that of the program's figure.
 - ``picture``: both states of a scenario at 480x270, from the rendered scene: time of
   eye and frame, and how much of the light the states move (the mean difference of
   linear light, in parts of white; one cannot be compared with anything else).
