@@ -32,9 +32,7 @@ from clients.batch.work import (
     batch_settings,
 )
 from clients.commands.options import read_object
-from estimator import (
-    InvalidFile,
-)
+from estimator import InvalidFile
 
 
 def batch_of(options: BatchOptions) -> Batch:

@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clients.batch.manifest import LINES, Manifest
-from clients.batch.run import EYE_FRAMES, UNIT_FRAMES, Batch, missing_units
+from clients.batch.run import Batch, missing_units
 from clients.batch.source import SourceFrame
 from clients.batch.work import FAILURES, Job, Unit, UnitRunner
 from clients.frame_log import Notes, add_notes, note_line
@@ -184,13 +184,12 @@ def _seconds(
     """
     if not known:
         return math.nan
-    unit_frames = EYE_FRAMES if batch.has_own_eyes else UNIT_FRAMES
     mean_ms = float(np.mean([one.ms for one in known]))
     total_s, n_units = 0.0, 0
     for count in missing.values():
         if not count:
             continue
-        units = math.ceil(count / unit_frames)
+        units = math.ceil(count / batch.unit_frames)
         n_builders = min(n_workers, units)
         extra_s = np.mean([one.extra_s(count / n_builders) for one in known])
         total_s += n_builders * float(extra_s) + count * mean_ms / 1e3

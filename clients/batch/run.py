@@ -42,8 +42,9 @@ UNIT_FRAMES = 16
 """Frames per unit of work: few enough that all workers finish at about the same time,
 and enough that distribution takes no time."""
 
-EYE_FRAMES = 64
-"""Frames per unit of frames with eyes of their own: one worker builds an eye."""
+MANY_EYES, EYE_FRAMES = 32, 64
+"""Number of eyes of single frames from which units are larger, so that one worker
+builds an eye: there are enough units for all workers."""
 
 SEGMENT_FRAMES = 48
 """Frames per video segment. The number does not depend on the workers, because it
@@ -106,6 +107,12 @@ class Batch:
     def count(self) -> int:
         """Number of results."""
         return sum(map(len, self.frames_of.values()))
+
+    @property
+    def unit_frames(self) -> int:
+        """Number of frames per unit of work, apart from videos."""
+        is_by_eye = self.has_own_eyes and len(self.frames_of) >= MANY_EYES
+        return EYE_FRAMES if is_by_eye else UNIT_FRAMES
 
     @property
     def folders(self) -> Sequence[str]:
@@ -291,7 +298,6 @@ def missing_units(batch: Batch, manifest: Manifest) -> list[Unit]:
     """
     units: list[Unit] = []
     known = cache(content_of)  # frames share segments, and profiles share inputs
-    unit_frames = EYE_FRAMES if batch.has_own_eyes else UNIT_FRAMES
     for profile in batch.frames_of:
         for segment, frames in _parts(batch, profile):
             is_done = _are_done(profile, frames, manifest, known)
@@ -300,7 +306,7 @@ def missing_units(batch: Batch, manifest: Manifest) -> list[Unit]:
             ]
             if missing and segment is not None:
                 missing = list(frames)  # a segment is always written completely
-            step = SEGMENT_FRAMES if segment is not None else unit_frames
+            step = SEGMENT_FRAMES if segment is not None else batch.unit_frames
             for start in range(0, len(missing), step):
                 some = tuple(missing[start : start + step])
                 units.append(Unit(len(units), profile, some, segment))

@@ -573,5 +573,5 @@ def _ms_since(start_s: float) -> float:
 
 
 def _cpu_ms_since(start_s: float) -> float:
-    """Return the CPU time of this process, without the time for building PSFs."""
+    """Return the CPU time of this process, which builds only eyes of single frames."""
     return round(1e3 * (time.process_time() - start_s), 2)

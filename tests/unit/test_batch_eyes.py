@@ -5,6 +5,7 @@ import hashlib
 import json
 import random
 import re
+import shutil
 from fractions import Fraction
 
 import numpy as np
@@ -448,6 +449,20 @@ def test_only_images_whose_rows_have_changed_are_filtered_again(classes, tmp_pat
     assert counts == [6, 1, 0, 6]
     assert labels[1] == labels[0] | {"dogs/0.png": "myopia"}
     assert labels[3] == labels[0]
+
+
+@pytest.mark.long("builds an eye twice")
+def test_an_image_that_fails_has_no_label_until_it_is_repaired(classes, tmp_path):
+    source, out = tmp_path / "source", tmp_path / "out"
+    shutil.copytree(classes, source)
+    content = (source / "cats/1.png").read_bytes()
+    (source / "cats/1.png").write_bytes(content[:100])
+    path = table(tmp_path, "image\n*\n")
+    for count in (COUNT - 1, COUNT):
+        batch = batch_of(options_of(source, out, profile=[PERSON], eyes=path))
+        assert len(finished(batch)["failures"]) == COUNT - count
+        assert len(labels_of(out)) == count
+        (source / "cats/1.png").write_bytes(content)
 
 
 # The estimate of time
