@@ -17,6 +17,7 @@ datasets       pairs of images, TUM RGB-D, NYU depth v2, Middlebury stereo
 work           job and its units, which read, filter and write frames
 pools          worker processes on this machine, or on many machines with Ray
 manifest       atomic writes, file hashes, and the record of the finished frames
+refraction     refraction of the eyes of single images, for their labels
 labels         table of the results with their eyes, for training
 run            runs the missing frames of a batch
 dry_run        estimates time and cost, and what the mode on-axis would lose

@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from clients.batch.manifest import LABELS, Manifest, text_of
+from clients.batch.refraction import POWER_VECTOR, WAVELENGTH_NM
 from clients.batch.source import Constant, SourceFrame
-from clients.batch.work import LABEL_WAVELENGTH_NM, POWER_VECTOR
 from filter_service import FilterSettings
 from filter_service.atomic_files import write_atomically
 
@@ -88,7 +88,7 @@ def _row(
         eye["person"],
         eye["sha256"],
         *(power[name] for name in POWER_VECTOR),
-        LABEL_WAVELENGTH_NM,
+        WAVELENGTH_NM,
         record["pupil_mm"],
         record["focus_dpt"],
         distance_m,

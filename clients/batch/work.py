@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clients.batch.manifest import COUNTS, Record, below, write_whole
+from clients.batch.refraction import RelaxedEye
 from clients.batch.source import (
     BadFrame,
     Constant,
@@ -47,7 +48,6 @@ from filter_service.settings import MAX_PLANES
 
 if TYPE_CHECKING:
     from clients.batch.video_reading import VideoReader
-    from estimator import Eye
 
 
 FORMATS = ("png", "npy", "exr", "ffv1", "h264")
@@ -62,9 +62,6 @@ PNG_LEVEL = 1
 
 EYES_FOLDER = "images"
 """Folder of the results of frames that have eyes of their own."""
-
-LABEL_WAVELENGTH_NM = 555.0
-POWER_VECTOR = ("M_dpt", "J0_dpt", "J45_dpt")
 
 ARCMIN_PER_MRAD = 60.0 * math.degrees(1e-3)
 
@@ -215,7 +212,7 @@ class UnitRunner:
         self._failure: FilterError | None = None
         self._readers: dict[Path, VideoReader] = {}
         self._eye_notes: tuple[str, ...] | None = None  # of an eye without a record
-        self._quality: tuple[str, Eye | None] = "", None  # of the eye that frames use
+        self._relaxed: tuple[str, RelaxedEye] | None = None
         self.build_s = 0.0
 
     def close(self) -> None:
@@ -408,30 +405,13 @@ class UnitRunner:
         return seen.color, color.grid, record
 
     def _refraction(self, eye: FrameEye, pupil_mm: float) -> dict[str, float] | None:
-        """Return the power vector of the relaxed eye at the cornea through a pupil.
-
-        It is None if light does not pass the eye there.
-        """
-        from estimator import Eye  # loads slowly
-
-        name, quality = self._quality
-        if name != eye.name or quality is None:
+        """Return the power vector of the eye of a frame."""
+        if self._relaxed is None or self._relaxed[0] != eye.name:
             profile, age_years = eye.profile, self._job.settings.age_years
             if age_years is not None:
                 profile = replace(profile, age_years=age_years)
-            self._quality = eye.name, Eye(profile)
-        quality = self._quality[1]
-        assert quality is not None
-        try:
-            found = quality.refraction(
-                pupil_diameter_mm=pupil_mm, wavelength_nm=LABEL_WAVELENGTH_NM
-            )
-        except ValueError:
-            return None
-        if not np.isfinite(found.values).all():
-            return None
-        values = dict(zip(found.coords["quantity"].tolist(), found.values, strict=True))
-        return {name: round(float(values[name]), 5) for name in POWER_VECTOR}
+            self._relaxed = eye.name, RelaxedEye(profile)
+        return self._relaxed[1].power_vector(pupil_mm)
 
     def open(self, *, has_own_eyes: bool) -> EyeFilter:
         """Return the filter, which is opened by the first call.

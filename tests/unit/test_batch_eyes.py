@@ -19,11 +19,12 @@ from clients.batch.eye_table import read_eyes, with_rows
 from clients.batch.eyes import MAX_DRAWN, Drawn, narrow_settings, uniform_numbers
 from clients.batch.manifest import Manifest
 from clients.batch.options import BatchOptions
+from clients.batch.refraction import RelaxedEye
 from clients.batch.run import missing_units, run_batch
 from clients.batch.source import Constant, FieldOfView, SourceFrame, States
 from clients.batch.work import UnitRunner
 from clients.commands.program import app
-from estimator import InvalidFile
+from estimator import Eye, InvalidFile, parse_profile
 from filter_service import Camera, EyeBank
 from filter_service.command_line import exit_code
 from filter_service.image_files import read_color
@@ -434,6 +435,20 @@ def test_refraction_in_labels_is_the_prescription(classes, tmp_path):
         found = [float(row[f"refraction_{name}_dpt"]) for name in ("m", "j0", "j45")]
         j = 0.5 * np.array([np.cos(np.radians(60.0)), -np.sin(np.radians(60.0))])
         np.testing.assert_allclose(found, [-2.5, *j], atol=0.02)
+
+
+@pytest.mark.long("traces two eyes in several states")
+@pytest.mark.parametrize("body", [{"kind": "synteyes", "sample": 3}, FLAT])
+def test_refraction_in_labels_is_that_of_traced_wavefronts(body):
+    profile = parse_profile(body)
+    relaxed, eye = RelaxedEye(profile), Eye(profile)
+    for pupil_mm in (2.1, 3.0, 3.6, 5.5):
+        found = relaxed.power_vector(pupil_mm)
+        traced = eye.refraction(pupil_diameter_mm=pupil_mm)
+        expected = dict(zip(traced.coords["quantity"], traced.values, strict=True))
+        for name, value_dpt in found.items():
+            assert value_dpt == pytest.approx(expected[name], abs=0.003)
+    assert relaxed.power_vector(30.0) is None
 
 
 @pytest.mark.long("builds two eyes twice")
