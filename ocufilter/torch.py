@@ -77,8 +77,8 @@ class SeeThrough(torch.nn.Module):
         name to see through another eye.
     camera : Camera
     depth_m : (height, width) or (n, height, width) float32, RgbdView, or sequence of it
-        Depth, as for `EyeFilter.operator`.  Assign another array to the attribute of
-        the same name to filter another scene.
+        Depth, as for `EyeFilter.operator`, or a tensor.  Assign another one to the
+        attribute of the same name to filter another scene.
     pupil_diameter_mm, focus_dpt : float, scalar tensor, or (n,) of them
         State of the eye; other values may be assigned to the attributes.  Tensors that
         require gradients, such as parameters, get those of `image_derivatives`, which
@@ -105,7 +105,7 @@ class SeeThrough(torch.nn.Module):
         self,
         profile: Any,
         camera: Camera,
-        depth_m: NDArray[Any] | RgbdView | Sequence[RgbdView],
+        depth_m: NDArray[Any] | torch.Tensor | RgbdView | Sequence[RgbdView],
         *,
         pupil_diameter_mm: float | Sequence[float] | torch.Tensor,
         focus_dpt: float | Sequence[float] | torch.Tensor,
@@ -268,6 +268,8 @@ class SeeThrough(torch.nn.Module):
                 name: value[number] if name in counts else value
                 for name, value in values.items()
             }
+            if isinstance(own["depth_m"], torch.Tensor):
+                own["depth_m"] = own["depth_m"].numpy(force=True)
             constant = self.gaze_deg, self.render_tolerance
             return _Sample(number, values["depth_m"], constant, **own)
 

@@ -123,6 +123,18 @@ def test_items_of_a_batch_may_have_eyes_states_and_depths_of_their_own(two, meth
     assert torch.equal(getattr(pickle.loads(pickle.dumps(two)), method)(color), images)
 
 
+def test_depth_may_be_a_tensor(two):
+    """As loaders return it."""
+    color, own = rand(2), copy.deepcopy(two)
+    own.depth_m = torch.from_numpy(np.ascontiguousarray(DEPTHS_M))
+    assert torch.equal(own(color), two(color))
+    assert own.operator(1) is own.operator(1)
+    own.profile, own.pupil_diameter_mm, own.focus_dpt = EYES[0], 4.0, 0.5
+    own.depth_m = torch.from_numpy(DEPTH_M)
+    assert torch.equal(own(color)[0], two(color)[0])
+    own.close()
+
+
 def test_operators_of_items_are_kept_until_their_parameters_change(two):
     first = [two.operator(number) for number in range(2)]
     own = copy.deepcopy(two)
