@@ -126,7 +126,7 @@ def filter_bands(
     *,
     settings: dict[str, Any],
 ) -> None:
-    """Filter an image of many wavelengths, or a picture as the cones see it.
+    """Filter an image in many wavelengths, or as cones see it.
 
     Each of many wavelengths has its own PSFs:
 

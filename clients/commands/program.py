@@ -43,7 +43,7 @@ COMMANDS = {
     ),
     "bands": (
         "clients.commands.filter_bands:filter_bands",
-        "Filter an image of many wavelengths, or a picture as the cones see it.",
+        "Filter an image in many wavelengths, or as cones see it.",
     ),
     "correct": (
         "clients.commands.correct_image:correct_image",
