@@ -50,6 +50,7 @@ def test_bands_of_the_display_equal_the_channels_of_an_rgb_frame():
     ) as band_filter:
         seen = band_filter.filter(bands, depth_m, **STATE)
     assert np.array_equal(seen.bands[..., [4, 2, 0]], expected)
+    assert [frame.color.size for frame in seen.groups] == [0, 0]
     assert not np.array_equal(seen.bands[..., 1], seen.bands[..., 3])
 
 
