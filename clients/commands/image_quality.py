@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+from clients.acuity_text import Notation, acuity_text
 from clients.commands.options import with_options
 from clients.commands.state_options import (
     EyeNames,
@@ -148,6 +149,13 @@ def mtf(
 def acuity(
     eyes: EyeNames,
     options: StateOptions,
+    notation: Annotated[
+        Notation | None,
+        typer.Option(
+            help="Add a column with the acuity as 20/40 (feet), 6/12 (meters), 0.50 "
+            "(decimal) or logMAR."
+        ),
+    ] = None,
     as_csv: Csv = False,
     plot: Plot = None,
     json_output: Json = False,
@@ -165,7 +173,14 @@ def acuity(
     states = options.states()
     _check(plot)
     title, found = _of_eyes(eyes, "acuity", states)
-    report(title, found, as_csv=as_csv, plot=plot, json_output=json_output)
+    report(
+        title,
+        found,
+        as_csv=as_csv,
+        plot=plot,
+        json_output=json_output,
+        notation=notation,
+    )
 
 
 @with_options
@@ -326,25 +341,41 @@ def report(
     as_csv: bool,
     json_output: bool,
     plot: Path | None = None,
+    notation: Notation | None = None,
 ) -> None:
-    """Print an array as a table, CSV or JSON, and write its plot."""
+    """Print an array as a table, CSV or JSON, and write its plot.
+
+    Parameters
+    ----------
+    notation : {"decimal", "feet", "meters", "log_mar"}, optional
+        Notation of ``log_mar`` in a column of its own.
+    """
+    columns, rows = [*found.columns()], [[*row] for row in found.rows()]
+    if notation is not None:
+        place = columns.index("log_mar")
+        columns.append("acuity")
+        for row in rows:
+            row.append(_acuity(row[place], notation))
     if plot is not None:
         from filter_service.atomic_files import replace_atomically
 
         write = partial(found.plot().savefig, dpi=110, format="png")
         replace_atomically(plot, write, is_private=True)
     if json_output:
-        rows = [
-            dict(zip(found.columns(), map(_finite, row), strict=True))
-            for row in found.rows()
-        ]
-        print_json({"eye": eye, "rows": rows, "notes": list(found.notes)})
+        named = [dict(zip(columns, map(_finite, row), strict=True)) for row in rows]
+        print_json({"eye": eye, "rows": named, "notes": list(found.notes)})
     elif as_csv:
         for note in found.notes:
             print(f"note: {note}", file=sys.stderr)
-        _print_csv(found)
+        writer = csv.writer(sys.stdout, lineterminator="\n")
+        writer.writerow(columns)
+        writer.writerows(rows)
     else:
-        _print_table(eye, found)
+        _print_table(eye, found, columns, rows)
+
+
+def _acuity(log_mar: float, notation: Notation) -> str:
+    return acuity_text(log_mar, notation) if math.isfinite(log_mar) else ""
 
 
 def _finite(value: Any) -> Any:
@@ -356,13 +387,9 @@ def _text(value: Any) -> str:
     return f"{value:.6g}" if isinstance(value, float | int) else str(value)
 
 
-def _print_csv(found: LabeledArray) -> None:
-    writer = csv.writer(sys.stdout, lineterminator="\n")
-    writer.writerow(found.columns())
-    writer.writerows(found.rows())
-
-
-def _print_table(eye: str, found: LabeledArray) -> None:
+def _print_table(
+    eye: str, found: LabeledArray, columns: list[str], rows: list[list[Any]]
+) -> None:
     """Print the columns that vary; the others are in the line before."""
     for note in found.notes:
         print_line(f"note: {note}")
@@ -374,14 +401,14 @@ def _print_table(eye: str, found: LabeledArray) -> None:
     print_line(f"{eye}: {', '.join(fixed)}")
     shown = [
         k
-        for k, name in enumerate(found.columns())
+        for k, name in enumerate(columns)
         if name not in found.coords or found.coords[name].ndim
     ]
-    rows = [[found.columns()[k] for k in shown]]
-    rows += [[_cell(row[k]) for k in shown] for row in found.rows()]
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    for row in rows:
-        cells = zip(row, widths, strict=True)
+    texts = [[columns[k] for k in shown]]
+    texts += [[_cell(row[k]) for k in shown] for row in rows]
+    widths = [max(map(len, column)) for column in zip(*texts, strict=True)]
+    for line in texts:
+        cells = zip(line, widths, strict=True)
         print_line("  ".join(f"{cell:>{width}}" for cell, width in cells))
 
 

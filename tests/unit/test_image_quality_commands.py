@@ -81,9 +81,11 @@ def test_options_of_light_change_the_mtf(tmp_path):
 
 @pytest.mark.long("acuity at two distances and three defoci")
 def test_acuity_and_through_focus_have_a_column_for_each_quantity():
-    rows = rows_of(printed("acuity", "myopia", "--object-dpt", "0,6", "--csv"))
+    words = ("--object-dpt", "0,6", "--notation", "feet", "--csv")
+    rows = rows_of(printed("acuity", "myopia", *words))
     far, near = (float(row["log_mar"]) for row in rows)
     assert near < 0.0 < 0.8 < far
+    assert rows[0]["acuity"] == f"20/{20.0 * 10.0**far:.0f}"
     words = ("through-focus", "emmetropia", "--defocus-dpt=-1:1:1", "--csv")
     rows = rows_of(printed(*words))
     assert [float(row["defocus_dpt"]) for row in rows] == [-1.0, 0.0, 1.0]
