@@ -151,12 +151,16 @@ class Focusing(ABC):
             code = "focus_nearer_than_near_point"
             nearest_dpt = max(0.0, round(near_dpt, 3))
             seen = f"nothing nearer than {_distance(nearest_dpt)} is sharp"
+            if nearest_dpt <= OUT_OF_REACH_DPT:
+                seen = "only far distances are sharp"
             reached = f"is nearer than the near point ({nearest_dpt:.3g} dpt)"
         else:
             code = "focus_out_of_reach"
-            little = ", which few people notice" if near_dpt > -NOTICED_DPT else ""
-            seen = f"the eye lacks {-near_dpt:.2g} dpt even for far distances{little}"
-            reached = f"is out of reach by {focus_dpt - near_dpt:.3g} dpt"
+            lacking_dpt = focus_dpt - near_dpt
+            little = ", which few people notice" if lacking_dpt < NOTICED_DPT else ""
+            seen = f"the eye lacks {lacking_dpt:.2g} dpt for {_distance(focus_dpt)}"
+            seen += little
+            reached = "is out of reach, as is every distance"
         added_dpt = self.vergence.vergence_dpt(near_dpt) - self.vergence.vergence_dpt(
             far_dpt
         )
