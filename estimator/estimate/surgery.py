@@ -122,6 +122,11 @@ class EyeWithImplant(GivenSurfaces):
             "surgery; the aberrations of the natural lens are gone, those of the "
             "cornea are the estimated eye's"
         )
+        if self.profile.kind != "prescription":
+            text += (
+                ": if a cataract caused the measured ones, the eye sees better than "
+                "computed"
+            )
         return Note(
             "implant",
             text,

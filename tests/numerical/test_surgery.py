@@ -305,6 +305,13 @@ def test_a_misplaced_toric_implant_leaves_astigmatism():
     assert 2.0 * np.hypot(j0, j45) == pytest.approx(expected_dpt, rel=0.1)
 
 
+@pytest.mark.parametrize("person", ["myope", "cataract"])
+def test_measured_aberrations_may_be_those_of_the_lens(person):
+    notes = eye_of(PERSONS[person], IMPLANT).notes
+    (note,) = [n for n in notes if n.code == "implant"]
+    assert ("if a cataract caused" in note) == (person == "cataract")
+
+
 def test_what_goes_with_the_natural_lens_is_stated():
     body = {
         **MYOPE,
