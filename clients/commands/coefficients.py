@@ -54,8 +54,11 @@ N_COMPARED = 6
 def measurement_at(
     profile: "EyeProfile", *, h_deg: float, v_deg: float
 ) -> "Measurement | None":
-    """Return the leading measurement in a direction; prescriptions have none."""
-    if profile.kind not in ("zernike", "zernike_set"):
+    """Return the leading measurement in a direction.
+
+    Prescriptions have none, and a measurement before surgery is of another wavefront.
+    """
+    if profile.kind not in ("zernike", "zernike_set") or profile.surgery is not None:
         return None
     return next(
         (m for m in profile.measurements if (m.h_deg, m.v_deg) == (h_deg, v_deg)), None

@@ -376,7 +376,12 @@ class EyeStudy:
 
     @property
     def source_label(self) -> str:
-        """Return the source of the wavefront: entered, measured or example."""
+        """Return the source of the wavefront: entered, measured, example or computed.
+
+        After surgery it is computed.
+        """
+        if self.profile.surgery is not None:
+            return "computed"
         if self.profile.kind in ("prescription", "eye"):
             return "entered"
         return "example" if self.is_example else "measured"

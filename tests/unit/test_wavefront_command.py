@@ -203,3 +203,15 @@ def test_the_45_parameters_are_an_eye_too(tmp_path):
     relaxed = _json(path, *view)
     focused = _json(path, *view, "--focus-dpt", "4")
     assert focused["zernike_um"][4] - relaxed["zernike_um"][4] > 0.5
+
+
+def test_a_measurement_before_surgery_is_not_beside_the_eye_after_it():
+    body = {"kind": "preset", "name": "keratoconus"}
+    view = ("--pupil-mm", "4", "--wavelength-nm", "555")
+    before = _json(json.dumps(body), *view)
+    implant = {"kind": "iol", "residual_sphere_dpt": 0}
+    after = _json(json.dumps(body | {"correction": implant}), *view)
+    assert "measured" in before
+    assert "measured" not in after
+    j = 4  # (2,0)
+    assert abs(after["zernike_um"][j]) < 0.005 < 1.0 < before["zernike_um"][j]
