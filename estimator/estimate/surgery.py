@@ -10,7 +10,7 @@ has the residual refraction, and the fourth-order term of the surface with which
 wavefront on `ABERRATION_RADIUS_MM` has the requested C(4,0).
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 
@@ -112,12 +112,14 @@ class EyeWithImplant(GivenSurfaces):
     def _implant_note(self) -> Note:
         lens, surgery = self.implant, self.profile.surgery
         assert surgery is not None
-        toric = ""
+        toric, remaining = "", _shown(surgery.residual)
         if lens.cylinder_dpt >= 0.01:
             toric = f", toric by {lens.cylinder_dpt:.2f} dpt"
+        if isinstance(surgery, ImplantSurgery) and not surgery.is_toric:
+            remaining = f"a spherical equivalent of {remaining}"
         text = (
             f"implant of {lens.power_dpt:.2f} dpt{toric}, {lens.center_mm:.2f} mm "
-            f"behind the cornea, solved such that {_shown(surgery.residual)} remains "
+            f"behind the cornea, solved such that {remaining} remains "
             "at the cornea (555 nm, 4 mm); cornea, length and retina are those before "
             "surgery; the aberrations of the natural lens are gone, those of the "
             "cornea are the estimated eye's"
@@ -260,7 +262,8 @@ def _with_implant(
     wanted = _wanted(natural, surgery.residual, cornea_um + _added_um(surgery))
     start = np.array([1.0 / FIRST_RADIUS_MM, 0.0, 0.0, 0.0])
     steps = np.array([1e-4, 1e-4, 1e-4, 1e-5])
-    numbers = _solved(found, wanted, start=start, steps=steps)
+    free = [0, 1, 2, 3] if surgery.is_toric else [0, 3]  # without J0 and J45
+    numbers = _solved(found, wanted, start=start, steps=steps, free=free)
     implant = _labeled(numbers, center_mm)
     _check("power of the implant", implant.power_dpt, IMPLANT_RANGE_DPT, "dpt")
     surfaces = eye(numbers, surgery)
@@ -438,25 +441,35 @@ def _solved(
     *,
     start: Numbers,
     steps: Numbers,
+    free: Sequence[int] = (0, 1, 2, 3),
 ) -> Numbers:
-    """Return the numbers (n,) at which ``found`` has the wanted values (n,).
+    """Return the numbers (4,) at which ``found`` has the wanted values (4,).
+
+    Parameters
+    ----------
+    found : callable
+        Function from rows (n, 4) of numbers to rows (n, 4) of values.
+    free : sequence of int
+        Numbers that are solved, and the values that they shall meet; others stay.
 
     Raises
     ------
     TraceFailed
         Newton's method does not converge, or light does not pass.
     """
-    tolerance = np.array([TOLERANCE_DPT] * 3 + [TOLERANCE_UM])
-    numbers = start
+    place = [*free]
+    tolerance = np.array([TOLERANCE_DPT] * 3 + [TOLERANCE_UM])[place]
+    numbers = start.copy()
     for _ in range(MAX_STEPS):
-        values = found(numbers + np.vstack([np.zeros(4), np.diag(steps)]))
-        missing = wanted - values[0]
+        values = found(numbers + np.vstack([np.zeros(4), np.diag(steps)[place]]))
+        values = values[:, place]
+        missing = wanted[place] - values[0]
         if not np.isfinite(values).all():
             break
         if (np.abs(missing) < tolerance).all():
             return numbers
-        slopes = (values[1:] - values[0]) / steps[:, None]
-        numbers = numbers + np.linalg.solve(slopes.T, missing)
+        slopes = (values[1:] - values[0]) / steps[place, None]
+        numbers[place] += np.linalg.solve(slopes.T, missing)
     raise TraceFailed(
         "no surface that light passes gives the refraction after surgery "
         f"{rx.format_prescription(rx.prescription_from_power_vector(*wanted[:3]))} dpt"

@@ -196,6 +196,14 @@ class IntraocularBody(Body, kw_only=True):
     ) = UNSET
     residual_cylinder_dpt: ResidualCylinderDpt = 0.0
     residual_axis_deg: ResidualAxisDeg | UnsetType = UNSET
+    toric: Annotated[
+        bool,
+        Meta(
+            description="with `residual_sphere_dpt`: whether the implant has the "
+            "cylinder that leaves the residual cylinder; false leaves the cylinder of "
+            "the cornea, and the sphere is the spherical equivalent"
+        ),
+    ] = True
     sphere_dpt: SphereDpt = 0.0
     cylinder_dpt: CylinderDpt = 0.0
     axis_deg: AxisDeg | UnsetType = UNSET

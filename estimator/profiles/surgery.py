@@ -58,11 +58,15 @@ class ImplantSurgery(Surgery):
     decentration_mm : (x, y)
         Position of its center, x to the person's right, y up, as seen in the entrance
         pupil.
+    is_toric : bool
+        Whether its cylinder is solved; otherwise the sphere of ``residual`` is the
+        spherical equivalent.
     """
 
     center_mm: float | None = None
     rotation_deg: float = 0.0
     decentration_mm: tuple[float, float] = (0.0, 0.0)
+    is_toric: bool = True
 
     def lens_decentration_mm(self, center_mm: float) -> tuple[float, float]:
         """Return the decentration in the plane of an implant at a depth."""
@@ -96,6 +100,12 @@ def parse_surgery(body: CorrectionBody | None) -> Surgery | None:
                     "a number from -10 to 10",
                 )
         return None
+    if not body.toric and body.residual_cylinder_dpt:
+        raise ProfileError(
+            PATH + "residual_cylinder_dpt",
+            "is that of the cornea, because toric is false",
+            "no value, or toric true",
+        )
     for name in NOT_WITH_RESIDUAL:
         if getattr(body, name) not in (0.0, UNSET):
             raise ProfileError(
@@ -110,6 +120,7 @@ def parse_surgery(body: CorrectionBody | None) -> Surgery | None:
         None if body.depth_mm is UNSET else body.depth_mm,
         body.rotation_deg,
         body.decentration_mm,
+        body.toric,
     )
 
 

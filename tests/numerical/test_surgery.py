@@ -12,10 +12,12 @@ from estimator.field.field_table import field_table
 from estimator.field.prepare import prepare_eye
 from estimator.field.traced_eye import TracedEye
 from estimator.field.traced_fields import peripheral_residual
-from estimator.optics.prescription import Prescription
+from estimator.optics.prescription import Prescription, power_vectors_dpt
+from estimator.optics.surfaces import media_indices, pack_eye
 from estimator.optics.zernike import index_from_nm
+from estimator.profiles.given_eyes import cornea_alone
 from estimator.profiles.parse import ProfileError, parse_profile
-from estimator.wavefront.aberrations import wavefront_aberrations
+from estimator.wavefront.aberrations import on_axis_zernike, wavefront_aberrations
 from tests.numerical.iol_formulas import FORMULAS
 
 MYOPE = {
@@ -294,6 +296,22 @@ def test_color_is_that_of_phakic_eyes():
     assert found[1] == pytest.approx(found[0], abs=0.02)
 
 
+@pytest.mark.parametrize("person", ["myope", "keratoconus"])
+def test_an_implant_without_cylinder_leaves_that_of_the_cornea(person):
+    body = PERSONS[person]
+    plain = {**IMPLANT, "toric": False, "residual_sphere_dpt": -0.75}
+    eye = eye_of(body, plain)
+    assert eye.implant.cylinder_dpt == 0.0
+    m_dpt, j0_dpt, j45_dpt = on_axis_dpt({**body, "correction": plain})
+    assert m_dpt == pytest.approx(-0.75, abs=0.02)
+    alone = cornea_alone(eye.relaxed)
+    zernike_um = on_axis_zernike(
+        pack_eye(alone)[None], media_indices(alone, 555.0), zernike_radius_mm=2.0
+    )[0][0]
+    cornea_dpt = power_vectors_dpt(zernike_um, 2.0)[1:]
+    assert [j0_dpt, j45_dpt] == pytest.approx(cornea_dpt, abs=0.06)
+
+
 def test_a_misplaced_toric_implant_leaves_astigmatism():
     """By a rotation of the lens alone: 2 C sin(10 deg) of its cylinder C."""
     body = {**MYOPE, "cylinder_dpt": -4, "higher_order": "none"}
@@ -365,6 +383,11 @@ DIGEST_OF_VERSION_0_2 = (
             {"kind": "iol", "residual_cylinder_dpt": -1},
             "residual_sphere_dpt",
             "a number from -10 to 10",
+        ),
+        (
+            {**IMPLANT, **TORIC_REST, "toric": False},
+            "residual_cylinder_dpt",
+            "toric true",
         ),
         ({**IMPLANT, "residual_sphere_dpt": 20}, "residual_sphere_dpt", "a number"),
     ],
