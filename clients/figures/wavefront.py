@@ -224,7 +224,9 @@ def draw_wavefront_map(
     """
     rms = rms_um(zernike_um, from_order=from_order)
     if rms < LEAST_RMS_UM:
-        _draw_no_map(axes, title)
+        is_higher = from_order >= LOWEST_HIGHER_ORDER
+        known = "none are known,\nand none are assumed" if is_higher else "flat"
+        _draw_no_map(axes, title, known)
         return
     values = wavefront_values_um(zernike_um, from_order=from_order)[:, ::-1]
     top = max(float(np.abs(values[in_circle(SIDE_COUNT)]).max()), MIN_RANGE_UM)
@@ -261,11 +263,11 @@ def draw_wavefront_map(
     color_bar(axes, drawn, label="µm")
 
 
-def _draw_no_map(axes: Axes, title: str) -> None:
-    """Say that there is nothing to draw: none are measured, entered or assumed."""
+def _draw_no_map(axes: Axes, title: str, text: str) -> None:
+    """Say that there is nothing to draw."""
     style_image_axes(axes, title=title)
     axes.text(
-        0.5, 0.5, "none are known,\nand none are assumed", color=SOFT,
+        0.5, 0.5, text, color=SOFT,
         fontsize=SMALL_PT, ha="center", va="center", transform=axes.transAxes,
     )  # fmt: skip
     axes.set_box_aspect(1.0)
