@@ -21,6 +21,7 @@ from clients.web.controls import (
     prescription_texts,
 )
 from clients.web.eye_form import (
+    CATARACT,
     DESIGNS,
     DISTANCE_KINDS,
     HAZES,
@@ -37,6 +38,12 @@ SOURCES = {"prescription": "Prescription", "preset": "Preset", "file": "File"}
 
 NO_HIGHER_ORDER = (
     "Without aberrations of the age: the prescription is that after lens surgery."
+)
+
+CATARACT_AGE_YEARS = 50.0
+YOUNG_CATARACT = (
+    "At {:.0f} years the eye still accommodates. Most people with a cataract are over "
+    "60: set the age above."
 )
 
 TYPING_MS = 400
@@ -227,7 +234,12 @@ class EyePanel:
 
     def show_haze(self) -> None:
         """Say how much light the eye scatters, which depends on the age."""
-        self._haze.text = self.form.haze_text(age_years=self._age_years())
+        age_years = self._age_years()
+        texts = [self.form.haze_text(age_years=age_years)]
+        is_cataract = self.form.source == "preset" and self.form.preset == CATARACT
+        if is_cataract and age_years < CATARACT_AGE_YEARS:
+            texts.append(YOUNG_CATARACT.format(age_years))
+        self._haze.text = " ".join(filter(None, texts))
         self._haze.set_visibility(bool(self._haze.text))
 
     def _correction(self) -> None:

@@ -86,6 +86,10 @@ CONDITIONS_HELP = (
     "photograph without depth. The pencil beside a slider takes a typed value, such as "
     "6 m, 40 cm, 20 ft or 2.5 dpt."
 )
+NORMAL = (
+    "Every eye is sharp only where it looks: what is at the side is blurred, and dark "
+    "edges have colored fringes. People do not notice either in their own sight."
+)
 NOT_MEDICAL = (
     "Not a medical device: for demonstration and research. It models the optics of an "
     "eye, not its health, and does not replace an examination."
@@ -178,6 +182,7 @@ class Page:
                         self.scenarios.build_text()
                         self._note = ui.label("").classes("oc-note")
                         self._note.props("aria-live=polite")
+                        ui.label(NORMAL).classes("oc-hint")
                     with ui.element("div").classes("oc-results"):
                         self.figures.build_figure()
             self._show_views()

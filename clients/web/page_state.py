@@ -73,7 +73,7 @@ READING_GAZE_DEG = -30.0
 
 VERSION = 1
 MAX_CHARACTERS = 8000
-"""Length limit of a fragment; every entry of both eyes takes 1,600 characters."""
+"""Length limit of a fragment; every entry of four states takes 3,600 characters."""
 
 MAX_ENTRY_CHARACTERS = 40
 SCENES = ("courtyard", "primitives", "night_road", "stairs", "chart")
