@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args
 
 from clients.acuity_text import Notation
+from clients.scenarios import Scenario
 from clients.web.comparison import (
     B_OF,
     EYE_NAMES,
@@ -298,6 +299,27 @@ class PageState:
             FOCUS.name: distance_dpt,
         }
         self.is_focus_set = False
+
+    def start_scenario(self, scenario: Scenario) -> None:
+        """Set the entries to those of a scenario."""
+        notation = self.notation
+        self.reset()
+        self.notation = notation
+        gaze_h_deg, gaze_v_deg = scenario.gaze_deg
+        values: dict[NumberField, float] = {
+            PUPIL: scenario.pupil_diameter_mm,
+            FOCUS: scenario.focus_dpt,
+            DISTANCE: scenario.focus_dpt,
+            GAZE_H: gaze_h_deg,
+            GAZE_V: gaze_v_deg,
+        }
+        self.values |= {
+            number.name: round(number.clamped(v), 4) for number, v in values.items()
+        }
+        side = self.sides[0]
+        for name, one in ((side, scenario.a), (B_OF[side], scenario.b)):
+            self.load_body(name, one.profile, one.title)
+        self.wants_comparison = True
 
     def load_body(self, eye: EyeName, body: Mapping[str, Any], name: str) -> None:
         """Load a profile into an eye, with the age of the person."""

@@ -6,35 +6,11 @@ from collections.abc import Callable
 
 from nicegui import events, ui
 
-from clients.scenarios import Scenario, scenarios
-from clients.web.comparison import B_OF
-from clients.web.controls import DISTANCE, FOCUS, GAZE_H, GAZE_V, PUPIL, NumberField
+from clients.scenarios import scenarios
 from clients.web.page_state import PageState
 from clients.web.widgets import select
 
 CHOOSE = "choose"
-
-
-def start(state: PageState, scenario: Scenario) -> None:
-    """Set the entries of a page to those of a scenario."""
-    notation = state.notation
-    state.reset()
-    state.notation = notation
-    gaze_h_deg, gaze_v_deg = scenario.gaze_deg
-    values: dict[NumberField, float] = {
-        PUPIL: scenario.pupil_diameter_mm,
-        FOCUS: scenario.focus_dpt,
-        DISTANCE: scenario.focus_dpt,
-        GAZE_H: gaze_h_deg,
-        GAZE_V: gaze_v_deg,
-    }
-    state.values |= {
-        number.name: round(number.clamped(v), 4) for number, v in values.items()
-    }
-    side = state.sides[0]
-    for name, one in ((side, scenario.a), (B_OF[side], scenario.b)):
-        state.load_body(name, one.profile, one.title)
-    state.wants_comparison = True
 
 
 class ScenarioMenu:
@@ -66,7 +42,7 @@ class ScenarioMenu:
             f"A: {scenario.a.title}. B: {scenario.b.title}. "
             f"{scenario.sees} {scenario.leaves_out}"
         )
-        start(self._state, scenario)
+        self._state.start_scenario(scenario)
         self._on_start(scenario.scene)
 
     def clear(self) -> None:

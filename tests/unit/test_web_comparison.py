@@ -22,10 +22,9 @@ from clients.web.controls import (
     distance_text,
     pupil_by_light_mm,
 )
-from clients.web.figure_panel import WIDTHS_ARCMIN, nearest_familiar_object
+from clients.web.familiar_sizes import WIDTHS_ARCMIN, nearest_familiar_object
 from clients.web.page_state import PageState, fragment_of, restore
 from clients.web.picture import chart_picture, coarser, png_of, shown_srgb8
-from clients.web.scenario_menu import start
 from filter_service import RgbdView
 from tests.unit.web_parts import a_picture
 
@@ -124,7 +123,7 @@ def test_corrections_of_other_kinds_are_one_difference():
 @pytest.mark.parametrize("name", scenarios())
 def test_a_scenario_sets_both_states_as_they_are_described(name):
     scenario, state = scenarios()[name], PageState(picture=a_picture())
-    start(state, scenario)
+    state.start_scenario(scenario)
     request = state.request()
     for eye, described in (("OD", scenario.a), ("OD_B", scenario.b)):
         body = request.bodies[eye]
