@@ -105,7 +105,7 @@ def test_too_many_marked_cases_end_the_collection(run):
     assert run(cases, "-m", "not slow").returncode == 0
     finished = run(cases)
     assert finished.returncode == pytest.ExitCode.USAGE_ERROR
-    assert "161 cases are marked long; allowed: at most 180" in finished.stderr
+    assert "181 cases are marked long; allowed: at most 180" in finished.stderr
 
 
 def test_workers_refuse_a_mark_without_a_reason(run):
