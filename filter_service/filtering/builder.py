@@ -190,7 +190,7 @@ class Builder:
         """Treat the frames in this block, of several streams, as one.
 
         The thread waits for the end of the block.  After each of eleven frames, its
-        search for predicted PSFs took a third of the time of an image of 31 bands.
+        search for predicted PSFs took a quarter of the time of an image of 31 bands.
         """
         wakes, self.wakes_after_frames = self.wakes_after_frames, False
         started_s = time.monotonic()
