@@ -23,11 +23,21 @@ _HALVES = np.nan_to_num(
     np.arange(65536, dtype=np.uint16).view(np.float16).astype(np.float32)
 )
 _BYTE_OF_HALF = np.rint(255.0 * _HALVES.clip(0.0, 1.0)).astype(np.uint8)
+_HALF_OF_TEN_BITS = (np.arange(1024) / 1023.0).astype(np.float16)
+_TEN_BITS_OF_HALF = np.rint(1023.0 * _HALVES.clip(0.0, 1.0)).astype(np.uint32)
+_OPAQUE_TWO_BITS = np.uint32(3 << 30)
 _DTYPES: dict[int, np.dtype[Any]] = {
     wire.SRGB8: np.dtype(np.uint8),
     wire.LINEAR8: np.dtype(np.uint8),
     wire.LINEAR16F: np.dtype(np.float16),
+    wire.LINEAR10: np.dtype(np.uint32),
 }
+
+
+def _shape(image: wire.Image, color_format: int) -> tuple[int, ...]:
+    """Return the shape of a color image: rows, columns and channels, unless packed."""
+    shape = image.height_px, image.width_px
+    return shape if color_format == wire.LINEAR10 else (*shape, 4)
 
 
 def check_frame(frame: wire.Frame) -> None:
@@ -90,9 +100,7 @@ class FrameImages:
         dtype = _DTYPES[frame.color_format]
         self._colors = [
             memory.array(
-                view.color.start,
-                (view.color.height_px, view.color.width_px, 4),
-                dtype,
+                view.color.start, _shape(view.color, frame.color_format), dtype
             )
             for view in frame.views
         ]
@@ -125,9 +133,13 @@ class FrameImages:
         """
         given = self._frame.views[index]
         raw = self._colors[index][self._rows(index)]
-        color = np.empty((*raw.shape[:2], 3), raw.dtype)
+        is_packed = self._frame.color_format == wire.LINEAR10
+        color = np.empty((*raw.shape[:2], 3), np.float16 if is_packed else raw.dtype)
         for channel, place in enumerate(self._channels):
-            color[..., channel] = raw[..., place]
+            if is_packed:
+                color[..., channel] = _HALF_OF_TEN_BITS[raw >> 10 * place & 1023]
+            else:
+                color[..., channel] = raw[..., place]
         if self._frame.color_format == wire.LINEAR8:
             color = _HALF_OF_BYTE[color]
         depth_m, note = self._depth_m(index)
@@ -150,7 +162,7 @@ class FrameImages:
     def _light(memory: Slot, quad: wire.QuadLayer) -> NDArray[np.float32]:
         raw = memory.array(
             quad.color.start,
-            (quad.color.height_px, quad.color.width_px, 4),
+            _shape(quad.color, quad.color_format),
             _DTYPES[quad.color_format],
         )
         return light_of(raw, quad.color_format, quad.flags)
@@ -201,11 +213,23 @@ class FrameImages:
         if self._frame.color_format == wire.LINEAR8:
             color = _BYTE_OF_HALF[color.view(np.uint16)]
         part = to[self._rows(index), begin:]
+        if self._frame.color_format == wire.LINEAR10:
+            self._pack(part, color[:, begin:])
+            return
         for channel, place in enumerate(self._channels):
             part[..., place] = color[:, begin:, channel]
         # Runtimes ignore the alpha of a layer that is not blended; screenshots do not.
         if not self._frame.flags & wire.IS_BLENDED:
             to[..., 3] = 255 if to.dtype == np.uint8 else 1.0
+
+    def _pack(self, to: NDArray[np.uint32], color: NDArray[Any]) -> None:
+        """Write halves as 10 bits per channel."""
+        is_blended = bool(self._frame.flags & wire.IS_BLENDED)
+        packed = to & _OPAQUE_TWO_BITS if is_blended else _OPAQUE_TWO_BITS
+        for channel, place in enumerate(self._channels):
+            levels = _TEN_BITS_OF_HALF[color[..., channel].view(np.uint16)]
+            packed = packed | levels << np.uint32(10 * place)
+        to[...] = packed
 
 
 # Depth that a program submits, which is often wrong

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,25 +53,25 @@ class Quad:
     eyes: tuple[Eye, ...]
 
 
-def light_of(
-    raw: NDArray[np.uint8] | NDArray[np.float16], color_format: int, flags: int
-) -> NDArray[np.float32]:
+def light_of(raw: NDArray[Any], color_format: int, flags: int) -> NDArray[np.float32]:
     """Return the light of a quad's image, as `Quad` has it.
 
     Parameters
     ----------
-    raw : (h, w, 4) uint8 or float16
+    raw : (h, w, 4) uint8 or float16, or (h, w) uint32
         As in the shared memory.
     color_format, flags : int
         Of the message.
     """
     rows = raw if flags & wire.TOP_FIRST else raw[::-1]
+    if color_format == wire.LINEAR10:
+        rows = _unpacked(rows)
     places = (2, 1, 0) if flags & wire.IS_BGR else (0, 1, 2)
     light = np.empty(rows.shape, np.float32)
     light[..., 3] = 1.0
     if flags & wire.IS_BLENDED:
         alpha = rows[..., 3].astype(np.float32)
-        light[..., 3] = alpha if raw.dtype == np.float16 else alpha / np.float32(255.0)
+        light[..., 3] = alpha / np.float32(255.0) if raw.dtype == np.uint8 else alpha
     for channel, place in enumerate(places):
         values = rows[..., place]
         if color_format == wire.SRGB8:
@@ -82,6 +83,12 @@ def light_of(
     if flags & wire.IS_BLENDED and flags & wire.IS_UNPREMULTIPLIED:
         light[..., :3] *= light[..., 3:]
     return light
+
+
+def _unpacked(packed: NDArray[np.uint32]) -> NDArray[np.float32]:
+    """Return channels of 10 bits and an opacity of 2 bits as numbers from 0 to 1."""
+    channels = [(packed >> 10 * i & 1023) / np.float32(1023.0) for i in range(3)]
+    return np.stack([*channels, (packed >> 30) / np.float32(3.0)], -1, dtype=np.float32)
 
 
 def draw_quads(picture: RgbdPicture, quads: Sequence[Quad]) -> None:

@@ -270,6 +270,12 @@ def set_fov(frame):
     frame.views[0].fov_rad[1] = 1.6
 
 
+def set_quad(frame):
+    quad = frame.quads[0]
+    quad.color, quad.color_format = wire.Image(0, 8, 8), wire.SRGB8
+    quad.orientation[3] = quad.size_m[0] = 1.0  # and no height
+
+
 BAD = {
     "nothing known": lambda layer: b"\x09\0\0\0",
     "too short": lambda layer: bytes(wire.Frame(wire.FRAME))[:-1],
@@ -284,6 +290,7 @@ BAD = {
     "start": spoiled(set_start),
     "size": spoiled(set_size),
     "field of view": spoiled(set_fov),
+    "quad": spoiled(set_quad),
 }
 
 

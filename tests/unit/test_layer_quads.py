@@ -158,5 +158,8 @@ def test_images_are_upright_with_opacity():
     assert given[0, 0] == pytest.approx((0.08, 0, 0.4, 0.4))
     bottom_first = light_of(raw, wire.LINEAR8, 0)
     assert bottom_first[1, 0] == pytest.approx((1, 0, 0.2, 1))
+    packed = np.array([[1023 | 341 << 20 | 2 << 30]], np.uint32)
+    ten = light_of(packed, wire.LINEAR10, wire.IS_BLENDED)
+    assert ten[0, 0] == pytest.approx((1, 0, 1 / 3, 2 / 3))
     half = light_of(np.full((1, 1, 4), np.nan, np.float16), wire.LINEAR16F, 0)
     assert half[0, 0] == pytest.approx((0, 0, 0, 1))

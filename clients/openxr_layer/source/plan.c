@@ -13,7 +13,9 @@ static bool is_inside(const swapchain *chain, const XrSwapchainSubImage *part) {
            part->imageArrayIndex < chain->info.arraySize;
 }
 
-static bool is_color(const swapchain *chain) { return chain->format && chain->format->wire; }
+static bool is_color(const swapchain *chain) {
+    return chain->format && chain->format->wire;
+}
 
 static bool is_depth(const swapchain *chain) {
     return chain->format && !chain->format->wire;

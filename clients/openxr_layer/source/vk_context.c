@@ -208,7 +208,8 @@ bool vk_make_image(vk_context *vk, vk_image *image, const VkImageCreateInfo *inf
     is_made = is_made &&
               allocate(vk, &needed, 0, VK_MEMORY_PROPERTY_DEVICE_LOCAL_BIT,
                        &image->memory) &&
-              vk_check(vk, vk->BindImageMemory(vk->device, image->handle, image->memory, 0));
+              vk_check(vk, vk->BindImageMemory(vk->device, image->handle, image->memory,
+                                               0));
     if (!is_made) vk_destroy_image(vk, image);
     return is_made;
 }

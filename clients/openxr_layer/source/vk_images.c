@@ -37,6 +37,8 @@ static const format_row FORMATS[] = {
     {{VK_FORMAT_B8G8R8A8_SRGB, WIRE_SRGB8, BGRA}, COLOR, 4},
     {{VK_FORMAT_R8G8B8A8_UNORM, WIRE_LINEAR8, RGBA}, COLOR, 4},
     {{VK_FORMAT_B8G8R8A8_UNORM, WIRE_LINEAR8, BGRA}, COLOR, 4},
+    {{VK_FORMAT_A2B10G10R10_UNORM_PACK32, WIRE_LINEAR10, RGBA}, COLOR, 4},
+    {{VK_FORMAT_A2R10G10B10_UNORM_PACK32, WIRE_LINEAR10, BGRA}, COLOR, 4},
     {{VK_FORMAT_R16G16B16A16_SFLOAT, WIRE_LINEAR16F, RGBA}, COLOR, 8},
     {{VK_FORMAT_D16_UNORM, 0, 0}, DEPTH, 0},
     {{VK_FORMAT_X8_D24_UNORM_PACK32, 0, 0}, DEPTH, 0},
@@ -285,7 +287,8 @@ static bool write_images(session *at, const image_write *writes, size_t count) {
     if (is_written) {
         for (size_t i = 0; i < count; ++i) {
             const wire_image *from = writes[i].from;
-            uint32_t pixel = ((const format_row *)format_of(writes[i].to->format))->pixel_bytes;
+            const image_format *format = format_of(writes[i].to->format);
+            uint32_t pixel = ((const format_row *)format)->pixel_bytes;
             memcpy(state->to_device.mapped + from->start, at->link.memory + from->start,
                    (size_t)from->width_px * from->height_px * pixel);
             record_write(state, writes + i);
@@ -298,7 +301,8 @@ static bool write_images(session *at, const image_write *writes, size_t count) {
 
 const graphics_api vk_api = {
     .name = "Vulkan",
-    .formats = "R8G8B8A8 and B8G8R8A8 (SRGB, UNORM), R16G16B16A16_SFLOAT",
+    .formats = "R8G8B8A8 and B8G8R8A8 (SRGB, UNORM), A2B10G10R10, A2R10G10B10, "
+               "R16G16B16A16_SFLOAT",
     .usage = XR_SWAPCHAIN_USAGE_TRANSFER_SRC_BIT,
     .open = open_graphics,
     .close = close_graphics,

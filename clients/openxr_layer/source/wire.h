@@ -23,7 +23,8 @@ enum { WIRE_HELLO = 1, WIRE_WELCOME, WIRE_MEMORY, WIRE_FRAME, WIRE_RESULT };
 enum {
     WIRE_SRGB8 = 1,   /* bytes, sRGB */
     WIRE_LINEAR8,     /* bytes, linear light */
-    WIRE_LINEAR16F    /* half floats, linear light */
+    WIRE_LINEAR16F,   /* half floats, linear light */
+    WIRE_LINEAR10     /* 32 bits, linear light: three channels of 10 and 2 of opacity */
 };
 
 enum {

@@ -159,7 +159,12 @@ static void make_chain(const struct session *session, struct chain *chain,
         .mipCount = 1,
     };
     *chain = (struct chain){
-        .is_color = is_color, .width = width, .height = height, .layers = layers, .samples = samples};
+        .is_color = is_color,
+        .width = width,
+        .height = height,
+        .layers = layers,
+        .samples = samples,
+    };
     MUST(xrCreateSwapchain(session->handle, &info, &chain->handle));
     union {
         XrSwapchainImageOpenGLKHR opengl[8];
@@ -230,7 +235,8 @@ static void release(struct session *session, struct chain *chain) {
     pthread_t thread;
     /* Two calls that may use the queue are not made at the same time. */
     if (options.plan.acquires_ahead && options.vulkan) acquire_ahead(chain);
-    else if (options.plan.acquires_ahead) pthread_create(&thread, NULL, acquire_ahead, chain);
+    else if (options.plan.acquires_ahead)
+        pthread_create(&thread, NULL, acquire_ahead, chain);
     may_use_queue = true;
     MUST_TIMED(session->release_ms, xrReleaseSwapchainImage(chain->handle, NULL));
     may_use_queue = false;
@@ -287,8 +293,8 @@ static void spoil_depth(const struct chain *chain, bool is_noise) {
 }
 
 static void attach_image(GLenum point, const struct chain *chain, uint32_t layer) {
-    attach(point, chain ? (GLuint)chain->images[chain->index] : 0, chain && chain->layers > 1,
-           layer);
+    attach(point, chain ? (GLuint)chain->images[chain->index] : 0,
+           chain && chain->layers > 1, layer);
 }
 
 static void draw_view(const struct plan *plan, const struct images *images,
