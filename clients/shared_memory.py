@@ -142,7 +142,7 @@ class SharedMemory:
             self.is_offered = False
             return
         try:
-            descriptor = os.open(reply.path, os.O_RDWR | os.O_CLOEXEC)
+            descriptor = os.open(reply.path, os.O_RDWR | getattr(os, "O_CLOEXEC", 0))
             slot = Slot.received(reply.slot, reply.size_bytes, descriptor)
         except (OSError, ValueError) as error:  # another machine, user or container
             log.info("no shared memory: %s", error)

@@ -136,7 +136,7 @@ def read_bytes(path: Path, *, max_bytes: int, option: str = "") -> bytes:
 
 def _open_at_once(path: str, flags: int) -> int:
     """Open a file without blocking, even a FIFO that has no writer."""
-    return os.open(path, flags | os.O_NONBLOCK)
+    return os.open(path, flags | getattr(os, "O_NONBLOCK", 0))  # not on Windows
 
 
 def read_text(

@@ -15,7 +15,8 @@ PART_NAME = re.compile(r"\.ocufilter-[0-9a-f]{32}\.part(\.\w+)?")
 is killed leaves one."""
 
 _PRIVATE = stat.S_IRUSR | stat.S_IWUSR
-_NEW_FILE = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
+_NEW_FILE = os.O_WRONLY | os.O_CREAT | os.O_EXCL
+_NEW_FILE |= getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_CLOEXEC", 0)  # Unix only
 
 
 def replace_atomically(
@@ -110,7 +111,7 @@ def _written_part(
     os.close(os.open(part, _NEW_FILE, mode))
     try:
         write(part)
-        with part.open("rb") as file:
+        with part.open("r+b") as file:  # Windows flushes only writable files
             os.fsync(file.fileno())  # before the rename, even in a power failure
         yield part
     finally:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import ctypes
-import resource
+import mmap
 from contextlib import suppress
 from pathlib import Path
 
@@ -14,11 +14,10 @@ def resident_memory_mb() -> float:
         pages = int(Path("/proc/self/statm").read_text().split()[1])
     except (OSError, IndexError, ValueError):
         return 0.0
-
-    return pages * resource.getpagesize() / 1e6
+    return pages * mmap.PAGESIZE / 1e6
 
 
 def trim_heap() -> None:
     """Return freed memory to the system (glibc; does nothing elsewhere)."""
-    with suppress(OSError, AttributeError):
+    with suppress(OSError, AttributeError, TypeError):  # TypeError: on Windows
         ctypes.CDLL(None).malloc_trim(0)

@@ -7,7 +7,6 @@ The system frees it when no process has it open.
 
 from __future__ import annotations
 
-import fcntl
 import math
 import mmap
 import os
@@ -72,6 +71,8 @@ class Slot:
         OutOfMemory
             If the system cannot allocate that much.
         """
+        import fcntl  # Unix only, like slots; other functions of this module are not
+
         size_bytes = -(-max(size_bytes, 1) // PAGE_BYTES) * PAGE_BYTES
         flags = os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING
         descriptor = -1
@@ -106,6 +107,8 @@ class Slot:
         ValueError
             If the file is not a sealed slot of that size.
         """
+        import fcntl
+
         seals = fcntl.fcntl(descriptor, fcntl.F_GET_SEALS)
         if not seals & fcntl.F_SEAL_SHRINK:
             raise ValueError(f"slot {number} is not sealed")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ctypes
-import fcntl
 import os
 import stat
 import struct
@@ -539,6 +538,8 @@ def _check_software_memory(descriptor: int, size_bytes: int) -> None:
         If the file could shrink, which would end this process by a bus error, is
         smaller than its header says, or does not have the stated size.
     """
+    import fcntl  # Unix only, like descriptors of textures
+
     try:
         found = os.fstat(descriptor)
         is_sealed = stat.S_ISREG(found.st_mode) and bool(

@@ -293,6 +293,13 @@ TRIM_INTERVAL = 8
 """Number of frames after which unused pages return to the system."""
 
 
+_PRIVATE = (
+    {"flags": mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS}
+    if hasattr(mmap, "MAP_PRIVATE")
+    else {}  # on Windows, whose anonymous maps are private
+)
+
+
 @dataclass(eq=False)
 class _Buffer:
     """Private memory, and how many of its bytes frames have used."""
@@ -312,7 +319,7 @@ class _Buffer:
         MemoryError
         """
         try:
-            memory = mmap.mmap(-1, n_bytes, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
+            memory = mmap.mmap(-1, n_bytes, **_PRIVATE)
         except OSError as error:
             raise MemoryError(
                 f"{n_bytes / 1e6:.0f} MB for a buffer of frames: {error.strerror}"
