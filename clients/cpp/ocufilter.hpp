@@ -97,6 +97,7 @@ class Client {
   // the service uses the previous eye.
   Ready set_profile(const Profile& profile, double timeout_s = 120.0) {
     if (profile.cameras.empty()) throw std::invalid_argument("cameras is empty; allowed: 1 or 2");
+    hello();  // whose time limit is shorter
     const std::int64_t id = request_profile(profile);
     const auto end = after(timeout_s);
     for (int n_missing = 1;;) {

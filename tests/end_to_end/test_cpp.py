@@ -276,9 +276,12 @@ def test_errors_name_their_field_and_leave_the_eye_in_use(
 @pytest.mark.clients
 def test_a_missing_service_is_an_error_after_the_time_limit(start_client):
     client = start_client("tcp://127.0.0.1:1", timeout_s=0.3)
-    found = client.expect_error("hello")
-    assert found["code"] == "service_timeout"
-    assert "tcp://127.0.0.1:1 is not connected" in found["message"]
+    for words in (["hello"], ["ping"], ["profile", "both", 8, 4, DOUBLE % 1]):
+        found = client.expect_error(*words)
+        assert found["code"] == "service_timeout"
+        assert (
+            "a reply to hello; tcp://127.0.0.1:1 is not connected" in found["message"]
+        )
 
 
 @pytest.mark.clients
@@ -537,6 +540,11 @@ def test_the_example_runs_as_its_comment_says(compile_program, real_service, tmp
     header = f"P6\n{WIDTH_PX} {HEIGHT_PX}\n255\n".encode()
     assert of_files.stdout == header + seen.color.tobytes()
     assert of_files.stderr.decode().splitlines() == list(seen.notes)
+    nowhere = subprocess.run(
+        [tmp_path / "cpp" / "example", "here"], capture_output=True
+    )
+    assert (nowhere.returncode, nowhere.stdout) == (1, b"")
+    assert nowhere.stderr.startswith(b"example: endpoint is 'here' (")
     wrong = run('{"kind": "nobody"}')
     assert (wrong.returncode, wrong.stdout) == (1, b"")
     assert wrong.stderr.startswith(b"example: kind: ")
