@@ -9,7 +9,6 @@ id, which a client chooses itself.
 from __future__ import annotations
 
 import enum
-import errno
 import logging
 import math
 import os
@@ -83,9 +82,6 @@ RESERVE = 32
 
 BASE_COUNT = 96
 """The reserve, plus the descriptors that are open without clients (30), rounded up."""
-
-OUT_OF_RESOURCES = (errno.EMFILE, errno.ENFILE, errno.ENOMEM)
-"""Errors of the system when descriptors or kernel memory are exhausted."""
 
 
 class DescriptorLimit:

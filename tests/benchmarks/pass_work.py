@@ -32,10 +32,6 @@ from tests.benchmarks.splat_work import splat_work
 STATE_STAGES = ("kernel_plan", "psf_blend")
 """Passes that only a changed state needs; the plan clears counters otherwise."""
 
-ARRAY_STAGES = ("encode",)
-TEXTURE_STAGES = ("show", "sample")
-"""Passes of frames of arrays and of textures alone."""
-
 SAMPLED_RATIO = 1.0 / 256.0
 
 

@@ -8,9 +8,6 @@ from numpy.typing import NDArray
 from tests.gl_witness.filter_frames import COUNTS, Filtered
 from tests.numerical.synthetic import psnr_db
 
-EQUAL_DB = 300.0
-"""What `psnr_db` says of equal pictures."""
-
 
 @dataclass(frozen=True)
 class Difference:
