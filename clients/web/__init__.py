@@ -13,7 +13,7 @@ eye_form       entries of an eye and its correction, and the resulting profile
 eye_panel      those entries on the page
 eyes_card      which eyes and states are shown, with the panels of their entries
 scenario_menu  scenarios, each with its scene, conditions, and states A and B
-familiar_sizes angular sizes of familiar things, for the width of a blur
+blur_widths    angular sizes of familiar things, for the width of a blur
 picture        pictures with depth: scenes, glTF files, photos, a letter chart
 picture_panel  scene and filtered picture with a split, with picture_view.js
 figure_panel   point-spread function under the pointer, and figures of the eye

@@ -11,9 +11,9 @@ from typing import Any
 from nicegui import events, ui
 
 from clients.scenes.letter_chart import smallest_row
+from clients.web.blur_widths import nearest_familiar_object
 from clients.web.comparison import EyeName
 from clients.web.controls import DISTANCE, distance_text
-from clients.web.familiar_sizes import nearest_familiar_object
 from clients.web.figure_worker import (
     FIGURE_TITLES,
     Ask,

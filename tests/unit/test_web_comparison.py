@@ -10,6 +10,7 @@ from PIL import Image
 
 from clients.acuity_text import acuity_text
 from clients.scenarios import scenarios
+from clients.web.blur_widths import WIDTHS_ARCMIN, nearest_familiar_object
 from clients.web.comparison import differences, joined_png
 from clients.web.controls import (
     AGE,
@@ -22,7 +23,6 @@ from clients.web.controls import (
     distance_text,
     pupil_by_light_mm,
 )
-from clients.web.familiar_sizes import WIDTHS_ARCMIN, nearest_familiar_object
 from clients.web.page_state import PageState, fragment_of, restore
 from clients.web.picture import chart_picture, coarser, png_of, shown_srgb8
 from filter_service import RgbdView
