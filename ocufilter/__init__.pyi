@@ -15,10 +15,12 @@ from estimator import DiffractiveRings as DiffractiveRings
 from estimator import DrawnFields as DrawnFields
 from estimator import EstimatedEye as EstimatedEye
 from estimator import Eye as Eye
+from estimator import EyeBiometry as EyeBiometry
 from estimator import EyeModel as EyeModel
 from estimator import EyeOptics as EyeOptics
 from estimator import EyeParameters as EyeParameters
 from estimator import EyeProfile as EyeProfile
+from estimator import EyeWithImplant as EyeWithImplant
 from estimator import FieldTable as FieldTable
 from estimator import GivenSurfaces as GivenSurfaces
 from estimator import InvalidFile as InvalidFile
@@ -48,11 +50,13 @@ from estimator import draws_axis as draws_axis
 from estimator import draws_eye as draws_eye
 from estimator import draws_periphery as draws_periphery
 from estimator import estimate_eye as estimate_eye
+from estimator import eye_biometry as eye_biometry
 from estimator import eye_model as eye_model
 from estimator import field_table as field_table
 from estimator import lms_weights as lms_weights
 from estimator import load_profile as load_profile
 from estimator import log_mar_of as log_mar_of
+from estimator import natural_eye as natural_eye
 from estimator import nm_from_index as nm_from_index
 from estimator import optical_transfer as optical_transfer
 from estimator import parse_profile as parse_profile
