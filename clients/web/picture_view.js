@@ -8,6 +8,7 @@ const POINT_MS = 90; // between two reports of the pointer position
 const RECONNECT_MS = 1000;
 const LINE_PX = 16; // height of a label beside a row of the chart
 const LABELS_EM = 7; // width of the labels, in their own font size
+const FRACTION_EM = 1.4; // by which fractions such as 20/200 are wider
 const LEAST_LINE_PX = 11; // smaller labels are illegible; only the caption is shown
 
 export default {
@@ -30,7 +31,7 @@ export default {
                 <line v-for="mark in labels" :x1="100 * mark.x + 1 + '%'" :y1="100 * mark.y + '%'"
                       :x2="labelsStart" :y2="mark.top + line / 2"></line>
               </svg>
-              <ol class="oc-marks" :style="{ ...(left === 'scene' ? clip : {}), fontSize: 0.75 * line + 'px', lineHeight: line + 'px' }">
+              <ol class="oc-marks" :class="{ 'oc-fractions': hasFractions }" :style="{ ...(left === 'scene' ? clip : {}), fontSize: 0.75 * line + 'px', lineHeight: line + 'px' }">
                 <li class="oc-marks-head"><template v-for="head in marks_head"><span>{{ head }}</span>{{ " " }}</template></li>
                 <li v-for="mark in labels" :style="{ top: mark.top + 'px' }"
                     :class="{ 'oc-read': readers(mark, eye, left).length }"
@@ -98,8 +99,12 @@ export default {
     line() {
       return Math.min(LINE_PX, this.height / (this.marks.length + 1));
     },
+    hasFractions() {
+      return this.marks.some((mark) => mark.texts.at(-1).includes("/"));
+    },
     labelsStart() { // px from the left to the labels
-      return Math.max(0, this.width - LABELS_EM * 0.75 * this.line - 4);
+      const labels_em = LABELS_EM + (this.hasFractions ? FRACTION_EM : 0);
+      return Math.max(0, this.width - labels_em * 0.75 * this.line - 4);
     },
     labels() {
       // beside their rows; moved up or down where rows are closer than lines

@@ -9,6 +9,19 @@ from PIL import Image
 from clients.scenarios import scenarios
 from tests.web.test_accessibility import violations
 
+CROSSING = """() => {
+  const inner = [...document.querySelectorAll('main .q-btn__content')]
+    .filter(element => element.offsetParent !== null);
+  return inner.filter(element => {
+    const button = element.closest('.q-btn').getBoundingClientRect();
+    const range = document.createRange();
+    range.selectNodeContents(element);
+    const text = range.getBoundingClientRect();
+    return text.left < button.left - 1 || text.right > button.right + 1;
+  }).map(element => element.innerText);
+}"""
+"""Labels that are wider than their buttons."""
+
 B = "[data-eye-panel=OD_B]"
 
 SIZES = """() => [...document.querySelectorAll(
@@ -102,6 +115,10 @@ def test_a_scenario_sets_scene_conditions_and_states(page):
     assert lines[1] > 2.0 * lines[0]  # decimal acuity with the addition
     page.pick(".oc-notation", "20/20")
     page.page.locator(".oc-marks-head").get_by_text("feet").wait_for()
+    cut_off = """() => [...document.querySelectorAll('.oc-marks span')]
+      .filter(text => text.scrollWidth > text.clientWidth + 1)
+      .map(text => text.innerText)"""
+    assert page.page.evaluate(cut_off) == []
 
 
 def test_a_distance_is_typed_and_chosen_as_people_say_it(page):
@@ -159,6 +176,7 @@ def test_what_is_pressed_is_large_enough(page):
             if min(width, height) < least_px - 0.1
         ]
         assert small == [], width_px
+        assert page.page.evaluate(CROSSING) == [], width_px
         assert page.page.evaluate("document.documentElement.scrollWidth") <= width_px
 
 
