@@ -84,7 +84,7 @@ def test_the_focus_of_a_click_has_two_decimals(page):
     note = page.page.locator(".oc-note").filter(has_text="accommodation stops")
     note.first.wait_for()
     text = note.first.inner_text()
-    assert re.search(r"Focus \d\.\d{1,2} dpt is", text)
+    assert re.search(r"[Ff]ocus \d\.\d{1,2} dpt is", text)
     assert "objective accommodation" in text
 
 
