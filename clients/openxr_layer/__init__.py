@@ -4,6 +4,6 @@ source        the layer, C: copies each frame, shows the filtered one
 helper        the process that filters the frames: sessions, eyes, profiles
 wire          messages between both, the socket of the helper, requests to it
 frame_images  images and submitted depth in their shared memory
-quads         quad layers, drawn into the picture of a view
+quads         quad layers, drawn into the pictures of the views
 program       `ocufilter layer`, and where the loader of OpenXR finds the layer
 """

@@ -70,6 +70,7 @@ const char *vk_open(vk_context *vk, const instance *own,
     if (reason) return reason;
     vk->GetDeviceQueue(vk->device, binding->queueFamilyIndex, binding->queueIndex,
                        &vk->queue);
+    if (!vk->queue) return "the application's Vulkan queue is unknown";
     if (make_batches(vk, binding->queueFamilyIndex)) return NULL;
     vk_close(vk);
     return "the Vulkan device provides no command buffers";
