@@ -270,6 +270,7 @@ class Page:
         if found.scene in (None, self.scene.kind) or keeps_file:
             self.request()
         else:
+            self.state.keeps_focus = True
             self.scene.choose(found.scene)
 
     def _start_scenario(self, scene: str) -> None:
@@ -279,6 +280,7 @@ class Page:
         if self.scene.kind == scene:
             self.request()
         else:
+            self.state.keeps_focus = True
             self.scene.choose(scene)
 
     def _show_values(self) -> None:
@@ -450,6 +452,7 @@ class Page:
 
     def _set_picture(self, picture: Picture) -> None:
         self.state.set_picture(picture)
+        self.scenarios.leave_unless(self.scene.kind)
         self._show_values()
         self.rows[DISTANCE.name].enable(
             picture.distance_dpt is not None, "as in the picture"

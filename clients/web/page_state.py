@@ -100,6 +100,8 @@ class PageState:
     shown : which eye, or both
     pipeline : pipeline of full pictures; previews are exact
     number : number of the last request
+    keeps_focus : whether the next picture keeps the focus, as it came with the link or
+        the scenario that selected it
     valid_profiles : the last valid profile of each eye
     """
 
@@ -120,7 +122,7 @@ class PageState:
     shown: Shown = "OD"
     pipeline: Pipeline = "exact"
     number: int = 0
-    _scene_focus_dpt: float | None = None
+    keeps_focus: bool = False
     valid_profiles: dict[EyeName, Mapping[str, Any]] = field(default_factory=dict)
 
     @property
@@ -239,15 +241,14 @@ class PageState:
     def set_picture(self, picture: Picture) -> None:
         """Set the picture; the first one also sets its initial focus and pupil.
 
-        The focus on a flat picture ends with it: a scene gets its own focus back.
+        The focus on a flat picture ends with it: a scene has its own initial focus.
         """
         was_flat = self.picture is not None and self.picture.distance_dpt is not None
-        is_flat = picture.distance_dpt is not None
-        if is_flat and self.picture is not None and not was_flat:
-            self._scene_focus_dpt = self.values[FOCUS.name]
-        elif was_flat and not is_flat and self._scene_focus_dpt is not None:
-            self.values[FOCUS.name] = self._scene_focus_dpt
-            self._scene_focus_dpt, self.is_focus_set = None, False
+        is_left = was_flat and picture.distance_dpt is None
+        if is_left and not self.keeps_focus:
+            self.values[FOCUS.name] = round(picture.focus_dpt or 0.0, FOCUS.digits)
+            self.is_focus_set = False
+        self.keeps_focus = False
         if self.picture is None:
             for number in (FOCUS, PUPIL):
                 value = getattr(picture, number.name)
@@ -355,7 +356,7 @@ class PageState:
         self.values.update(initial_values())
         self.shown, self.is_focus_set, self.pipeline = "OD", False, "exact"
         self.wants_comparison, self.arrangement = False, "divider"
-        self._scene_focus_dpt, self.light = None, BY_HAND
+        self.keeps_focus, self.light = False, BY_HAND
         self.notation = "decimal"
 
     def read_profiles(self) -> bool:

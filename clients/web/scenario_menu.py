@@ -45,6 +45,12 @@ class ScenarioMenu:
         self._state.start_scenario(scenario)
         self._on_start(scenario.scene)
 
+    def leave_unless(self, scene: str) -> None:
+        """Forget the scenario if another scene was selected."""
+        scenario = scenarios().get(self._list.value)
+        if scenario is not None and scenario.scene != scene:
+            self.clear()
+
     def clear(self) -> None:
         """Forget the scenario, for example when a link was followed."""
         self._list.value = CHOOSE

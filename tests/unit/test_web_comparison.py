@@ -3,6 +3,7 @@
 import base64
 import io
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -141,15 +142,17 @@ def test_a_scenario_sets_both_states_as_they_are_described(name):
 
 
 def test_the_focus_on_a_chart_ends_with_the_chart():
-    state = PageState()
-    state.set_picture(a_picture())
-    state.move(FOCUS.name, 0.5)
+    state, scene = PageState(), replace(a_picture(), focus_dpt=0.5)
+    state.set_picture(scene)
     state.set_picture(chart_picture(2.5))
-    state.is_focus_set = False
-    state.move(DISTANCE.name, 2.5)
     assert state.values[FOCUS.name] == 2.5
-    state.set_picture(a_picture())
+    state.move(FOCUS.name, 3.0)
+    state.set_picture(scene)
     assert state.values[FOCUS.name] == 0.5
+    state.set_picture(chart_picture(2.5))
+    state.values[FOCUS.name], state.keeps_focus = 0.025, True  # by a scenario
+    state.set_picture(scene)
+    assert state.values[FOCUS.name] == 0.025
 
 
 @pytest.mark.parametrize(
