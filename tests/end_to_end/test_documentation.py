@@ -35,7 +35,7 @@ def test_the_examples_of_a_page_run(path, tmp_path):
     printed = printed_by(script, cwd=tmp_path)
     if path.stem == "python":
         lines = printed.splitlines()
-        assert lines[0].startswith("(90, 160, 3) 1 ('focus 2 dpt")
+        assert lines[0].startswith("(90, 160, 3) 1 ('blurred: nothing beyond 17 cm")
         contrasts = [float(line.split()[1]) for line in lines[1:4]]
         assert contrasts == sorted(contrasts, reverse=True)
         assert contrasts[2] < 0.6 * contrasts[0]
