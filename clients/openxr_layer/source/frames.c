@@ -268,7 +268,7 @@ static void give_frame(session *at, const plan *p, uint64_t limit_ns) {
     if (!at->link.is_accepted || (!p && at->frame.state != FRAME_READING)) return;
     uint64_t begun_ns = now_ns();
     read_state read = p ? read_images(at, p) : READ_BEGUN;
-    if (read == READ_BEGUN && (!p || limit_ns)) read = at->api->finish_read(at, limit_ns);
+    if (read == READ_BEGUN) read = at->api->finish_read(at, limit_ns);
     add_time(at, &at->read_ns, begun_ns);
     at->frame.state = read == READ_FAILED ? FRAME_NONE : FRAME_READING;
     if (read == READ_DONE) send_frame(at);
