@@ -43,6 +43,7 @@ HELD = (
     "estimator/profiles/synteyes.json",
     "filter_service/PROTOCOL.md",
     "filter_service/*.schema.json",
+    "filter_service/display_spectra.json",
     "filter_service/service/ocufilter.service",
     "clients/assets/*",
     "clients/cpp/*",

@@ -31,8 +31,8 @@ static void split_pixels(void *argument, int item, int thread) {
     for (int64_t pixel = first; pixel < last; ++pixel) {
         const float *from = job->image + pixel * job->bands;
         const int64_t *band = job->band_of;
-        for (int64_t frame = 0; frame < job->count; ++frame, band += RGB) {
-            float *to = job->frames + RGB * (frame * job->pixels + pixel);
+        for (int64_t number = 0; number < job->count; ++number, band += RGB) {
+            float *to = job->frames + RGB * (number * job->pixels + pixel);
             for (int c = 0; c < RGB; ++c) to[c] = from[band[c]];
         }
     }
@@ -62,8 +62,8 @@ static void join_pixels(void *argument, int item, int thread) {
         float *to = job->image + pixel * job->bands;
         for (int64_t band = 0; band < job->bands; ++band) {
             int64_t place = job->place_of[band];
-            const float *frame = (const float *)(intptr_t)job->frames[place / RGB];
-            to[band] = frame[RGB * pixel + place % RGB];
+            const float *from = (const float *)(intptr_t)job->frames[place / RGB];
+            to[band] = from[RGB * pixel + place % RGB];
         }
     }
 }
