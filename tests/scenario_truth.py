@@ -1,4 +1,4 @@
-"""The main figure of each scenario, and an own calculation of it.
+"""The main figure of each scenario, and an independent calculation of it.
 
 Calculations use closed forms, sums over the pupil, or sums over the picture.  They take
 numbers of the profile and, with an implant, the coefficients of the eye.
@@ -45,7 +45,7 @@ class Figure:
     tolerance : float
         Largest difference, as the benchmark of that quantity states it.
     reference : str
-        What the own calculation is.
+        What the independent calculation is.
     """
 
     scenario: str

@@ -1,4 +1,4 @@
-"""The main figure of each scenario against an own calculation, and its pictures' time.
+"""The main figure of each scenario, an independent calculation of it, and times.
 
     python -m tests.benchmarks.bench_scenarios [--quick] [--json]
 

@@ -1,4 +1,4 @@
-"""Scenarios: each figure against an own calculation, and what the list contains."""
+"""Scenarios: each figure against an independent one, and what the list contains."""
 
 import math
 
