@@ -547,7 +547,7 @@ def test_a_dry_run_groups_notes_as_a_run_does(room, tmp_path):
     told, _ = run(*common, "--states", states, "--dry-run")
     notes = [line for line in told.splitlines() if "note:" in line]
     assert len([note for note in notes if "far point" in note]) == 1, told
-    assert re.search(r"\d+ frames: focus", notes[0])
+    assert re.search(r"\d+ frames: blurred: .* focus 0 to", notes[0])
 
 
 @pytest.mark.clients

@@ -321,7 +321,8 @@ def test_frames_beyond_the_credit_wait_and_the_newest_replaces_the_others(
     events = client.events(len(ids), "result", "dropped", "error")
     assert sorted(event[1] for event in events) == ids
     filtered = [event[1] for event in events if event[0] == "result"]
-    assert (filtered[0], filtered[-1]) == (ids[0], ids[-1])
+    # The second frame may reach a service that has not begun the first, and replace it.
+    assert filtered[0] in ids[: min(max_in_flight, 2)] and filtered[-1] == ids[-1]
     assert len(filtered) in n_filtered
     dropped = [event[3] for event in events if event[0] != "result"]
     assert dropped == ["superseded"] * (len(ids) - len(filtered))
