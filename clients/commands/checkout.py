@@ -47,8 +47,8 @@ def run_benchmark(
     if name not in names:
         raise ValueError(f"bench: unknown name '{name}'; allowed: {', '.join(names)}")
     _run_module(
-        f"tests.benchmarks.bench_{name}",
-        [*["--quick"] * quick, *["--json"] * json_output, *context.args],
+        "tests.benchmarks",
+        [name, *["--quick"] * quick, *["--json"] * json_output, *context.args],
     )
 
 

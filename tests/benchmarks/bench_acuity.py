@@ -1,7 +1,5 @@
 """Transfer functions and visual acuity, compared with published tables and formulas.
 
-    python -m tests.benchmarks.bench_acuity [--quick] [--json]
-
 - ``transfer``: modulation of 129 measured eyes through 4 mm, terms of orders 3 and 4,
   less Watson's mean of 200 best corrected eyes (J. Vision 13(6):18, 2013).  Once in
   perfect focus, once with what best correction leaves: a sphere that differs by 0.3 dpt
@@ -15,11 +13,8 @@
   where they differ by more than 0.1.  ``beyond the range`` is the distance from it.
 - ``retina``: Nyquist frequency at the fovea less Watson's 65.37 cpd (J. Vision
   14(7):15, 2014).
-
-Writes results/acuity.json.
 """
 
-import argparse
 import time
 from pathlib import Path
 
@@ -41,8 +36,9 @@ from estimator.profiles.typical_aberrations import (
     typical_zernike_um,
 )
 from tests import human_data
-from tests.benchmarks.harness import Row, memory_mb, publish
+from tests.benchmarks.harness import Row, Run, memory_mb
 
+MINUTES = 1
 PEOPLE = Path(__file__).parents[1] / "data" / "peripheral_wavefronts.npz"
 PEOPLE_PUPIL_MM = 4.0
 HIGHER_ORDERS = slice(6, 15)
@@ -196,23 +192,14 @@ def summary_rows(rows: list[Row]) -> list[Row]:
     return found
 
 
-def main() -> None:
-    """Run, print, and write results/acuity.json."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true", help="a few eyes and pupils")
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
-    options = parser.parse_args()
-    step = 20 if options.quick else 1
-    pupils_mm = (3.0,) if options.quick else PUPILS_MM
-    defocus_dpt = (1.0, 4.0) if options.quick else DEFOCUS_DPT
-    rows = transfer_rows(step) + acuity_rows(pupils_mm, defocus_dpt) + retina_rows()
-    publish(
-        "acuity",
-        rows + summary_rows(rows),
-        as_json=options.json,
-        is_whole=not options.quick,
+def measure(run: Run) -> list[Row]:
+    """Return the rows of some or all eyes, pupils and defocus."""
+    rows = (
+        transfer_rows(20 if run.is_quick else 1)
+        + acuity_rows(
+            (3.0,) if run.is_quick else PUPILS_MM,
+            (1.0, 4.0) if run.is_quick else DEFOCUS_DPT,
+        )
+        + retina_rows()
     )
-
-
-if __name__ == "__main__":
-    main()
+    return rows + summary_rows(rows)

@@ -10,7 +10,8 @@ import resource
 import shutil
 import subprocess
 import time
-from dataclasses import asdict, dataclass
+from argparse import Namespace
+from dataclasses import asdict, dataclass, field
 from importlib.metadata import version
 from pathlib import Path
 
@@ -22,6 +23,14 @@ OUT = ROOT / "out"
 """Where what is not a whole run goes."""
 
 WARM_UPS = 2
+
+
+@dataclass(frozen=True)
+class Run:
+    """How a benchmark runs: ``options`` holds those that it adds itself."""
+
+    is_quick: bool = False
+    options: Namespace = field(default_factory=Namespace)
 
 
 @dataclass(frozen=True)
