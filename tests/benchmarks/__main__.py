@@ -30,7 +30,7 @@ def main(arguments: list[str]) -> None:
     if name not in names:
         sys.exit(f"benchmark: unknown name '{name}'; allowed: {', '.join(names)}")
     module = importlib.import_module(f"tests.benchmarks.bench_{name}")
-    if not hasattr(module, "measure"):
+    if not hasattr(module, "MINUTES"):
         sys.argv = [module.__name__, *rest]
         runpy.run_module(module.__name__, run_name="__main__", alter_sys=True)
         return
