@@ -3,7 +3,6 @@
 
 PYTHON := .venv/bin/python
 ARGS ?=
-RESULTS := tests/benchmarks/results
 # `make test` is one call: a failed test hides no other.  On two cores, two workers that take
 # the next test as they become free end together; tests of a file share its fixtures.
 TESTS := tests/unit tests/numerical tests/end_to_end
@@ -12,11 +11,9 @@ PYTEST := $(PYTHON) -m pytest
 ORDER_SEED ?= 1
 PARALLEL := -n auto --maxprocesses 4 --dist loadfile -p randomly --randomly-seed $(ORDER_SEED)
 OFTEN := not clock and not slow and not gpu
-# Excluded: soak takes 30 minutes, gpu needs a hardware GPU, and witness a path tracer.
-BENCHES := $(filter-out gpu soak witness,$(patsubst tests/benchmarks/bench_%.py,%,$(sort $(wildcard tests/benchmarks/bench_*.py))))
 
 .DEFAULT_GOAL := help
-.PHONY: demo docs web test test-gl test-clients test-tools test-timed test-training test-examples test-batch-ray test-headset test-layer test-layer-applications test-web test-workflows validate witness gl-witness gpu-kit check clean help setup setup-test setup-test-clients setup-training setup-examples setup-batch-ray setup-page setup-docs setup-web setup-workflows setup-witness setup-peers peers release release-check setup-release setup-release-check
+.PHONY: demo docs web test test-gl test-clients test-tools test-timed test-training test-examples test-batch-ray test-headset test-layer test-layer-applications test-web test-workflows results validate witness gl-witness gpu-kit check clean help setup setup-test setup-test-clients setup-training setup-examples setup-batch-ray setup-page setup-docs setup-web setup-workflows setup-witness setup-peers peers release release-check setup-release setup-release-check
 
 demo: setup  ## filter two scenes through six eyes; writes out/demo/
 	$(PYTHON) -m ocufilter demo $(ARGS)
@@ -71,21 +68,12 @@ test-workflows: setup-workflows  ## lint the workflows in .github/ with actionli
 test-web: setup-web  ## test `ocufilter web` in headless Chromium
 	$(PYTEST) $(PARALLEL) tests/web $(ARGS)
 
-validate: setup-test setup-web  ## run the slow tests and every benchmark; writes JSON results
+results: setup-test  ## measure every benchmark at this commit; writes results and tables
+	$(PYTHON) -m tests.benchmarks results $(ARGS)
+
+validate: setup-test setup-web  ## run the slow tests and every benchmark; writes out/validate/
 	$(PYTHON) -m pytest -m "slow and not gpu" --ignore tests/training $(ARGS)
-	mkdir -p $(RESULTS) out
-	for bench in $(BENCHES); do \
-	    $(PYTHON) -m ocufilter bench $$bench --json > out/$$bench.json && \
-	    $(PYTHON) -m json.tool --indent 1 out/$$bench.json $(RESULTS)/$$bench.json \
-	    || exit 1; \
-	done
-	for how in ipc shm curve tcp; do for eyes in mono stereo; do \
-	    case $$eyes in mono) many="--rate-hz 10";; stereo) many="--stereo --rate-hz 3";; esac; \
-	    $(PYTHON) -m ocufilter bench roundtrip --transport $$how $$many \
-	        --json > out/roundtrip.json && $(PYTHON) -m json.tool --indent 1 \
-	        out/roundtrip.json $(RESULTS)/roundtrip_$${how}_$$eyes.json || exit 1; \
-	done; done
-	$(PYTHON) -m tests.benchmarks.bench_wavefront
+	$(PYTHON) -m tests.benchmarks results --out out/validate
 	sh tests/headset/setup_root.sh --applications && $(MAKE) test-layer-applications \
 	    || test $$? -eq 77 # where there can be no chroot
 

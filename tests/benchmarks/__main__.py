@@ -1,5 +1,7 @@
 """Run a benchmark: ``python -m tests.benchmarks NAME [--quick] [--json]``.
 
+``results`` in place of NAME measures all of them: see `measure_all`.
+
 A benchmark is a module ``bench_NAME`` with
 
 - a docstring that says what it measures, and which ``--help`` prints;
@@ -17,12 +19,15 @@ import importlib
 import runpy
 import sys
 
+from tests.benchmarks import measure_all
 from tests.benchmarks.harness import ROOT, Run, publish
 
 
 def main(arguments: list[str]) -> None:
     """Run the benchmark that the first argument names."""
     name, *rest = arguments or [""]
+    if name == "results":
+        sys.exit(measure_all.main(rest))
     names = sorted(
         path.stem.removeprefix("bench_")
         for path in (ROOT / "tests/benchmarks").glob("bench_*.py")

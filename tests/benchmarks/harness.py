@@ -19,8 +19,13 @@ import numpy as np
 
 ROOT = Path(__file__).parents[2]
 RESULTS = Path(__file__).parent / "results"
+"""Committed results.  Only ``make results`` writes there: see `written_path`."""
+
 OUT = ROOT / "out"
-"""Where what is not a whole run goes."""
+
+KEPT_RESULTS = ("gl_witness", "gpu", "headset_monado", "render_h100")
+"""Results of hardware and of a headset's runtime: they keep the commit at which they
+were measured, because ``make results`` cannot repeat them on any machine."""
 
 WARM_UPS = 2
 
@@ -82,6 +87,16 @@ def machine_info() -> dict:
     }
 
 
+def git(*arguments: str) -> str:
+    """Return what git prints about the checkout; empty if it fails or is missing."""
+    if shutil.which("git") is None:
+        return ""
+    answer = subprocess.run(
+        ("git", *arguments), cwd=ROOT, capture_output=True, text=True, check=False
+    )
+    return answer.stdout.strip("\n") if answer.returncode == 0 else ""
+
+
 def commit_id() -> str:
     """Short hash of the checkout, with "+" where files differ from it.
 
@@ -90,15 +105,6 @@ def commit_id() -> str:
     told = os.environ.get("OCUFILTER_COMMIT")
     if told:
         return told
-    if shutil.which("git") is None:
-        return "none"
-
-    def git(*arguments: str) -> str:
-        answer = subprocess.run(
-            ("git", *arguments), cwd=ROOT, capture_output=True, text=True, check=False
-        )
-        return answer.stdout.strip() if answer.returncode == 0 else ""
-
     changed = git("status", "--porcelain", "--untracked-files=no")
     head = git("rev-parse", "--short", "HEAD")
     return (head or "none") + ("+" if changed else "")
@@ -136,10 +142,16 @@ def report(rows: list[Row], *, machine: dict | None = None) -> dict:
     }
 
 
+def written_path(file_name: str) -> Path:
+    """Return where a whole run writes a file: in out/, or where `measure_all` says."""
+    folder = Path(os.environ.get("OCUFILTER_RESULTS") or OUT)
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder / file_name
+
+
 def write_report(name: str, content: dict) -> Path:
-    """Write a report to tests/benchmarks/results/NAME.json."""
-    RESULTS.mkdir(parents=True, exist_ok=True)
-    path = RESULTS / f"{name}.json"
+    """Write the report NAME.json of a whole run; see `written_path`."""
+    path = written_path(f"{name}.json")
     path.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
     return path
 
@@ -166,19 +178,19 @@ def publish(
     is_whole: bool,
     details: dict[str, list[dict]] | None = None,
 ) -> None:
-    """Print rows as a table or as JSON, and write those of a whole run.
+    """Print rows as JSON, or print them as a table and write those of a whole run.
 
     ``details`` are lists of other figures, which are printed below the table.
     """
     content = report(rows) | (details or {})
-    if is_whole:
-        write_report(name, content)
     if as_json:
         print(json.dumps(content))
-    else:
-        print_rows(rows)
-        for line in (line for lines in (details or {}).values() for line in lines):
-            print("  ".join(f"{name}={value}" for name, value in line.items()))
+        return
+    print_rows(rows)
+    for line in (line for lines in (details or {}).values() for line in lines):
+        print("  ".join(f"{name}={value}" for name, value in line.items()))
+    if is_whole:
+        print(f"wrote {write_report(name, content)}")
 
 
 def print_rows(rows: list[Row]) -> None:

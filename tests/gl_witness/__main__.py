@@ -6,7 +6,7 @@
 tests: all that draw with OpenGL, on llvmpipe and on zink over lavapipe, with the
 variants of the passes for software and those for a GPU.  frames: the same frames
 by each, beside the native engine's and each other's.  layers: what Vulkan's
-validation layers say of them.  Each part has its place in results/gl_witness.json.
+validation layers say of them.  Each part has its place in out/gl_witness.json.
 It fails where a test does, or the layers find a fault.
 """
 
@@ -15,7 +15,7 @@ import json
 import shutil
 import sys
 
-from tests.benchmarks.harness import RESULTS, report, write_report
+from tests.benchmarks.harness import RESULTS, report, write_report, written_path
 from tests.gl_witness.drivers import DRIVERS, FETCHED, renderer_info
 from tests.gl_witness.outcomes import run_all_tests, say
 from tests.gl_witness.tables import compare_frames, watch_layers
@@ -51,8 +51,9 @@ def main(arguments: list[str] | None = None) -> int:
 
 def keep(part: str, rows: list[dict], drivers: dict) -> None:
     """Write a part of the results, beside those that there are of the others."""
-    path = RESULTS / f"{NAME}.json"
-    content = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+    files = (written_path(f"{NAME}.json"), RESULTS / f"{NAME}.json")
+    text = next((f.read_text(encoding="utf-8") for f in files if f.is_file()), "{}")
+    content = json.loads(text)
     head = {key: value for key, value in report([]).items() if key != "rows"}
     write_report(NAME, {**content, part: {**head, "drivers": drivers, "rows": rows}})
 
