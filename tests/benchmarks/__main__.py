@@ -1,6 +1,7 @@
 """Run a benchmark: ``python -m tests.benchmarks NAME [--quick] [--json]``.
 
-``results`` in place of NAME measures all of them: see `measure_all`.
+In place of NAME, ``results`` measures all of them (`measure_all`), and ``tables``
+writes the tables of the documents (`tables`).
 
 A benchmark is a module ``bench_NAME`` with
 
@@ -19,7 +20,7 @@ import importlib
 import runpy
 import sys
 
-from tests.benchmarks import measure_all
+from tests.benchmarks import measure_all, tables
 from tests.benchmarks.harness import ROOT, Run, publish
 
 
@@ -28,6 +29,8 @@ def main(arguments: list[str]) -> None:
     name, *rest = arguments or [""]
     if name == "results":
         sys.exit(measure_all.main(rest))
+    if name == "tables":
+        sys.exit(tables.main())
     names = sorted(
         path.stem.removeprefix("bench_")
         for path in (ROOT / "tests/benchmarks").glob("bench_*.py")

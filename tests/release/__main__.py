@@ -10,7 +10,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from tests.release import aarch64, build, contents, pins, pythons
+from tests.release import aarch64, build, contents, pins, pythons, results
 from tests.release.commands import BUILD, ROOT, TOOLS, Failed, run, say
 
 DIST = ROOT / "dist"
@@ -87,6 +87,8 @@ def quick() -> None:
     check_without_compiler(sdist, BUILD / "first")
     for path in built[0]:
         print(f"{path.name}: {path.stat().st_size / 1e6:.1f} MB; two builds are equal")
+    for line in results.differing(results.commits()):
+        say(f"{line}; `make release` requires results of one commit")
     print(check_metadata(built[0]), end="")
     print(pins.check_pins())
 
@@ -135,6 +137,8 @@ def checklist(
 def release(options: argparse.Namespace) -> None:
     """Build, check and test everything."""
     warn_of_changes()
+    if lines := results.differing(results.commits()):
+        raise Failed("\n".join(["run `make results`", *lines]))
     os.umask(0o022)
     commit, built = build.build_twice(BUILD / "dist")
     sdist, x86_64, for_aarch64 = built
@@ -148,6 +152,7 @@ def release(options: argparse.Namespace) -> None:
     checks += check_metadata(built).splitlines()
     checks.append(pins.check_pins())
     check_without_compiler(sdist, BUILD / "without-compiler")
+    checks.append("results of benchmarks are those of one commit")
     checks.append("the sdist builds without a compiler and says what is missing")
     say("comparing the library for aarch64, under emulation, with that for x86-64")
     found = aarch64.compare(for_aarch64, x86_64)

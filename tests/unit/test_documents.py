@@ -88,20 +88,3 @@ def test_the_presets_are_those_that_exist():
     page = text_of("docs/reference/profiles.md")
     sentence = re.search(r"The name of a preset is also a profile: ([^.]*)\.", page)[1]
     assert tuple(re.findall(r"`(\w+)`", sentence)) == preset_names()
-
-
-def test_the_readme_shows_what_was_measured():
-    live = json.loads(text_of("tests/benchmarks/results/live.json"))
-    found = {
-        (row["case"], row["setting"]): row
-        for row in live["rows"]
-        if row["method"] == "frame"
-    }
-    for eye in preset_names():
-        cells = []
-        for size in ("480x270", "1280x720"):
-            row = found[eye, f"{size} 2 cores"]
-            cells.append(f"{row['median_ms']:.0f} ms, {row['error']:.1f} dB")
-        name = eye.replace("_", ".")
-        pattern = rf"^\| {name}.* \| " + r" \| ".join(cells) + r" \|"
-        assert re.search(pattern, text_of("README.md"), re.M | re.I), (eye, cells)

@@ -38,10 +38,9 @@ class Checkout:
         self.benchmarks = folder / "tests" / "benchmarks"
         self.results = self.benchmarks / "results"
         self.benchmarks.mkdir(parents=True)
-        for name in ("__main__", "harness", "measure_all", "tables", "table_kinds"):
-            path = ROOT / "tests" / "benchmarks" / f"{name}.py"
-            if path.exists():
-                shutil.copy(path, self.benchmarks)
+        for name in ("__main__.py", "harness.py", "measure_all.py", "tables.py"):
+            shutil.copy(ROOT / "tests" / "benchmarks" / name, self.benchmarks)
+        (self.benchmarks / "tables.toml").write_text("[sets]\n")
         for name, wait_s in (("one", 0.0), ("slow", 60.0)):
             text = GOOD.format(name=name, wait_s=wait_s)
             self.bench(name).write_text(text)
