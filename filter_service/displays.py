@@ -10,7 +10,7 @@ linear light and 47.6 to 49.8 dB encoded, with a display's own wavelengths 54 to
 48.3 to 49.8 dB, with the paper's 41 to 54 and 43 to 48 dB.  Two wavelengths per
 primary, one standard deviation of its light to both sides, reach 50.1 to 52.1 dB
 encoded with "common" and 51.2 to 53.4 with a display's own
-(tests/benchmarks/bench_displays.py).
+(tests/reference/display_pictures.py).
 """
 
 from __future__ import annotations

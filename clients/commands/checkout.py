@@ -24,7 +24,7 @@ def run_benchmark(
     name: Annotated[
         str,
         typer.Argument(
-            help="Benchmark to run, such as psf or live; any unknown name lists all."
+            help="Benchmark to run, such as acuity or live; any unknown name lists all."
         ),
     ],
     quick: Annotated[
@@ -34,7 +34,7 @@ def run_benchmark(
 ) -> None:
     """Time one part of the program and report its error alongside.
 
-    ocufilter bench psf --quick
+    ocufilter bench acuity --quick
 
     Requires a checkout; `ocufilter latency` measures a running service without one.
     Other options are passed to the benchmark:

@@ -3,10 +3,10 @@
 The prediction is a fit to 2,600 random wavefronts (pure cylinders with a meridian in
 focus, spherical aberration, coma, trefoil, higher orders and defocus; n = 16 to 400;
 pupils of 2 to 7 mm, three wavelengths, three pixel sizes).  Images were filtered with
-both engines, and the PSNR of 98 % of them exceeds the prediction (``bench_psf.py
---switch`` repeats this).  The RMS without tilt is a better predictor than the width of
-the spot, n = 2 g D / lambda, because a wide spot may have most of its light in a narrow
-core (coma, caustics), where ray optics fails.
+both engines, and the PSNR of 98 % of them exceeds the prediction.  The RMS without tilt
+is a better predictor than the width of the spot, n = 2 g D / lambda, because a wide
+spot may have most of its light in a narrow core (coma, caustics), where ray optics
+fails.
 
 Ray optics misplaces more light than wave optics where this choice permits it: 3.2 %
 against 0.2 % on average, over the six presets at 3 to 6 mm, fields to 25 deg, -4 to

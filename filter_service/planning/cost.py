@@ -141,8 +141,7 @@ LARGEST_RADIUS_PX = 1e9
 TERM_US = {"psf": 56.5, "wave": 2.24e-4, "texels": 0.0134}
 """Processor time per unit of each term of `cost_terms` on an AMD EPYC, in us.
 `relative_core_time` scales it for other machines.  36 batches of 768 PSFs of three eyes
-and three image sizes, 56 to 465 us per PSF, took 0.77 to 1.19 of the prediction
-(`python -m tests.benchmarks.bench_plan --calibrate` repeats the fit)."""
+and three image sizes, 56 to 465 us per PSF, took 0.77 to 1.19 of the prediction."""
 
 
 SERIES_US = 1.5e5

@@ -1,8 +1,7 @@
 """Sampled states of the frames of a cache, and the errors of PSFs blended for them.
 
-The law is a fit to measurements; `python -m tests.benchmarks.plan_law` repeats it.  The
-data are 3,600 random pairs of neighbors in defocus, pupil, accommodation and field,
-from five eyes, pupils of 2 to 7 mm, fields to 40 x 25 deg and pixels of 0.8 to
+The law is a fit to 3,600 random pairs of neighbors in defocus, pupil, accommodation and
+field, from five eyes, pupils of 2 to 7 mm, fields to 40 x 25 deg and pixels of 0.8 to
 3.5 mrad.  Each pair was blended half and half and compared with the exact PSF between
 its members on linear 720p frames of the scene *Courtyard*.
 

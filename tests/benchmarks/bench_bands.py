@@ -40,9 +40,9 @@ from filter_service import BandFilter, Camera, EyeFilter
 from filter_service.displays import primaries_of_spectra
 from filter_service.rendering.media_effects import linear_from_srgb
 from filter_service.rgbd_view import RgbdView
-from tests.benchmarks.bench_displays import measured_displays
 from tests.benchmarks.harness import Row, memory_mb, publish
 from tests.numerical.scene_frames import scene_view
+from tests.reference.display_pictures import measured_displays
 
 SIZE_PX, QUICK_SIZE_PX = (480, 270), (96, 54)
 COUNT, QUICK_COUNT = 7, 2

@@ -2,7 +2,7 @@
 
 Usage: python -m tests.benchmarks.bench_occlusion [--quick] [--json] [--engine NAME]
 
-Error: PSNR in linear light against rays through a thin lens (lens_reference), over the
+Error: PSNR in linear light against rays through a thin lens (`tests.reference.lens_picture`), over the
 whole picture, and over the band that light from both sides of an edge reaches.  The eye
 has no aberrations but defocus, for that is what the reference has.  Fragments are not
 merged, for that has an error of its own, edges or not; one method has them merged.
@@ -27,10 +27,10 @@ from tests.benchmarks.harness import (
     time_calls,
     write_report,
 )
-from tests.benchmarks.lens_reference import RAY_COUNT
 from tests.benchmarks.occlusion_scenes import Scene, client_scene, synthetic_scenes
 from tests.grid_specs import grid_spec
 from tests.numerical.synthetic import psnr_db
+from tests.reference.lens_picture import RAY_COUNT
 
 EYE = {"kind": "prescription", "sphere_dpt": 0.0}
 ONE_LAYER = {"hidden_color": None, "hidden_depth_m": None}

@@ -10,7 +10,7 @@ Shared with the renderer, so that errors there do not show:
 - the eye, the PSF engine, and the pinhole's geometry (direction and scale of a pixel);
 - the rule of accumulation: what is one depth (`DISCONTINUITY_PX` of geometrical blur),
   that its sources share the room, and what counts as no light (`MIN_COVERAGE`).  That
-  it is right is for `lens_reference` to say;
+  it is right is for `lens_picture` to say;
 - missing depth: the function that fills it.
 
 Distances, colours, order and sums are this file's own, or the float64 twins' of what

@@ -1,19 +1,10 @@
-"""Pictures of `bench_field`: error against time, and difference images."""
+"""Picture of `bench_field`: error against time and work."""
 
 from pathlib import Path
 
 import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
-from PIL import Image
-
-from filter_service.rendering.media_effects import srgb_from_linear
-from tests.benchmarks.cost_law import AGAINST
-
-DIFFERENCE_GAIN = 16.0
-"""Of linear light: a difference of 1/16 is white."""
-
 
 FROZEN_SUFFIX = " frozen"
 
@@ -107,55 +98,3 @@ def _medians(points: list[tuple[str, float, float]]) -> tuple[list, list]:
         found.append((np.median(own[:, 0]), 10.0 ** (-np.median(own[:, 1]) / 20.0)))
     found.sort()
     return [point[0] for point in found], [point[1] for point in found]
-
-
-def write_differences(
-    folder: Path, name: str, image: NDArray, reference: NDArray
-) -> None:
-    """Write image, reference and their difference side by side as one PNG."""
-    difference = DIFFERENCE_GAIN * np.abs(np.asarray(image, float) - reference)
-    parts = [srgb_from_linear(part) for part in (image, reference)]
-    parts.append(np.round(255.0 * np.clip(difference, 0.0, 1.0)).astype(np.uint8))
-    folder.mkdir(parents=True, exist_ok=True)
-    safe = "".join(c if c.isalnum() or c in ".-" else "_" for c in name)
-    Image.fromarray(np.concatenate(parts, axis=1)).save(folder / f"{safe}.png")
-
-
-def plot_costs(rows: list, path: Path) -> None:
-    """Log-log plots of frame time and evaluations, one panel a sweep.
-
-    Parameters
-    ----------
-    rows : list of cost_law.CostRow
-    """
-    mpl.use("Agg")
-    from matplotlib import pyplot
-
-    sweeps = list(dict.fromkeys(row.sweep for row in rows))
-    figure, panels = pyplot.subplots(
-        2,
-        len(sweeps),
-        figsize=(5 * len(sweeps), 8),
-        layout="constrained",
-        squeeze=False,
-    )
-    for column, sweep in enumerate(sweeps):
-        own = [row for row in rows if row.sweep == sweep]
-        for case, method in dict.fromkeys((row.case, row.method) for row in own):
-            line = [row for row in own if (row.case, row.method) == (case, method)]
-            line.sort(key=lambda row: getattr(row, AGAINST[sweep]))
-            x = [getattr(row, AGAINST[sweep]) for row in line]
-            style = {"marker": "o", "linestyle": "-" if method == "merged" else "--"}
-            name = f"{case}, {method}"
-            panels[0, column].loglog(
-                x, [row.median_ms for row in line], label=name, **style
-            )
-            panels[1, column].loglog(x, [row.evaluation_count for row in line], **style)
-        panels[0, column].set(title=sweep, ylabel="time of a frame, ms")
-        panels[1, column].set(xlabel=AGAINST[sweep], ylabel="PSF evaluations")
-        panels[0, column].legend(fontsize="x-small")
-    for axes in panels.flat:
-        axes.grid(which="both", alpha=0.3)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=120)
-    pyplot.close(figure)

@@ -8,10 +8,10 @@ from scipy.ndimage import distance_transform_edt
 
 from filter_service.rendering.frame import object_dpt
 from filter_service.rgbd_view import RgbdView
-from tests.benchmarks.lens_reference import NOTHING, STEP_PX, Lens, lens_picture
 from tests.benchmarks.view_sources import linear_color
 from tests.numerical.scene_frames import scene_view
 from tests.numerical.synthetic import tangents, texture
+from tests.reference.lens_picture import NOTHING, STEP_PX, Lens, lens_picture
 
 SYNTHETIC_FOV_DEG = 14.0
 FAR_DPT = 0.2

@@ -29,8 +29,8 @@ COURTYARD_SPECTRUM = (
     (0.025, 0.04, 0.063, 0.1, 0.16, 0.25, 0.4, 0.63, 1.0, 1.58, 2.5),
     (70.0, 35.0, 15.3, 5.25, 2.04, 0.943, 0.269, 0.085, 0.0265, 0.00668, 0.00137),
 )
-"""Variance of a pixel per frequency (rad/px) in linear 720p frames of *Courtyard*, as
-`tests.benchmarks.plan_law` measures it; its mean over all frequencies is 0.037."""
+"""Measured variance of a pixel per frequency (rad/px) in linear 720p frames of
+*Courtyard*; its mean over all frequencies is 0.037."""
 
 
 def spec_for(width_px=480, height_px=270, vertical_fov_deg=50.0, **settings):

@@ -1,4 +1,4 @@
-"""Shared by the PSF tests and `bench_psf.py`: wavefronts, a test image, error measures.
+"""Shared by the PSF tests: wavefronts, a test image, error measures.
 
 No tests here.  The wavefronts and where they come from: tests/data/psf_cases.json, and
 psf_field_cases.json for traced eyes over the visual field.

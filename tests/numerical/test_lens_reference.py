@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.signal import fftconvolve
 
-from tests.benchmarks.lens_reference import NOTHING, Lens, lens_picture
+from tests.reference.lens_picture import NOTHING, Lens, lens_picture
 
 pytestmark = pytest.mark.tools
 

@@ -9,10 +9,10 @@ from filter_service import constants
 from filter_service.errors import BadMessage
 from filter_service.rendering.frame import border_px_of
 from filter_service.rgbd_view import RgbdView
-from tests.benchmarks.lens_reference import NOTHING, Lens, lens_picture
 from tests.numerical.made_fragments import made_fragments
 from tests.numerical.synthetic import Bench, assert_same_frame, psnr_db, texture
 from tests.reference import render_passes as reference
+from tests.reference.lens_picture import NOTHING, Lens, lens_picture
 
 EMMETROPE = {"kind": "prescription", "sphere_dpt": 0.0}
 PURE = {"diffraction": False, "chromatic": False, "kept_energy_ratio": 0.9999}

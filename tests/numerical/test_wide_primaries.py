@@ -13,7 +13,8 @@ from filter_service.psfs.store import build_psf_store
 from filter_service.rendering.native import NativeRenderer
 from filter_service.rgbd_view import RgbdView
 from filter_service.settings import FilterSettings
-from tests.benchmarks.bench_displays import (
+from tests.numerical.plan_cases import spec_for, traced_eye
+from tests.reference.display_pictures import (
     HALF_WIDTH_MRAD,
     PITCH_MRAD,
     PUPIL_MM,
@@ -21,7 +22,6 @@ from tests.benchmarks.bench_displays import (
     measured_displays,
     true_picture,
 )
-from tests.numerical.plan_cases import spec_for, traced_eye
 
 PERFECT = {"kind": "prescription", "sphere_dpt": 0.0, "higher_order": "none"}
 WIDE = {"wide_primaries": True, "display": "618:14,536:20,453:13"}

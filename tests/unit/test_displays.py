@@ -18,14 +18,14 @@ from filter_service.displays import (
 )
 from filter_service.errors import BadMessage
 from filter_service.settings import FilterSettings
-from tests.benchmarks.bench_displays import (
+from tests.grid_specs import grid_spec
+from tests.reference.display_pictures import (
     errors_db,
     measured_displays,
     single_picture,
     true_picture,
     wide_picture,
 )
-from tests.grid_specs import grid_spec
 
 AT_NM = np.arange(400.0, 701.0, 5.0)
 
