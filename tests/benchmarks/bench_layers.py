@@ -1,36 +1,28 @@
-"""Layers, memory and times of the PSF cache by eye: Tables 6 and 9 of the paper.
+"""Layers, memory and times of the PSF cache by eye: tables 6 and 9 of the paper.
 
-Usage: python -m tests.benchmarks.bench_layers [--quick] [--json] [--engine NAME]
-
-One row for building the cache of an eye (of one pupil on axis as in Table 6; of pupils
-from 2 to 6 mm and foci from 0 to 4 dpt over the field as in Table 9) and one for making
-a frame's kernels from it, at 1280x720.  The paper's figures, on a TITAN Xp, stand in
-the setting.  Error: PSNR in linear light of the unmerged frame against one through a
-cache for just its pupil and focus, planned for 62 dB, or on axis with a quarter of the
-blur step.
+One row for building the cache of an eye (of one pupil on the axis as in table 6; of
+pupils of 2 to 6 mm and foci of 0 to 4 dpt over the field as in table 9) and one for
+making a frame's kernels from it, at 1280x720.  The paper's figures, on a TITAN Xp,
+stand in the setting.  Error: PSNR in linear light of the unmerged frame against one
+through a cache for just its pupil and focus, planned for 62 dB, or on the axis with a
+quarter of the blur step.
 """
 
-import argparse
-import json
 import time
 
 import numpy as np
 
 from filter_service.planning.plan import unchecked_plan
 from filter_service.psfs.store import build_psf_store
-from tests.benchmarks.engines import ENGINES, open_renderer
-from tests.benchmarks.harness import (
-    Row,
-    machine_info,
-    print_rows,
-    report,
-    write_report,
-)
+from filter_service.rendering.native import NativeRenderer
+from tests.benchmarks.harness import Row, Run
 from tests.benchmarks.paper_page.published import table
+from tests.benchmarks.rows import row_of
 from tests.numerical.plan_cases import spec_for, traced_eye
 from tests.numerical.scene_frames import scene_view
 from tests.numerical.synthetic import psnr_db
 
+MINUTES = 4
 SIZE = {"width_px": 1280, "height_px": 720, "object_range_dpt": (0.0, 8.0)}
 PUPIL_MM, FOCUS_DPT = 5.0, 0.5
 STATE = {"pupil_diameter_mm": PUPIL_MM, "focus_dpt": FOCUS_DPT}
@@ -42,22 +34,12 @@ GRIDS = {
 REFERENCE_DB = 62.0
 REFERENCE_STEP_PX = 0.125
 ATLAS_TEXEL_BYTES = 16
-_TEXTURE, _CACHE = table(6), table(9)["dynamic"]
-PAPER = {  # layers and texture MB on axis (Table 6); cache GB, texture MB (Table 9)
-    eye: (
-        (layers, _TEXTURE["memory_mib"]["proposed"][eye]),
-        (_CACHE["cache_gib"][eye], _CACHE["texture_mib"][eye]),
-    )
-    for eye, layers in _TEXTURE["layers"]["proposed"].items()
-}
-THEIRS = {
-    "on-axis": "theirs {} layers, {} MB",
-    "dynamic": "theirs {} GB cache, {} MB",
-}
+LAYERS, TEXTURE_MIB = (table(6)[key]["proposed"] for key in ("layers", "memory_mib"))
+CACHE = table(9)["dynamic"]
 
 
 def rendered(renderer, view, store):
-    """Frame through a store that no other frame has used."""
+    """Render a frame through a store that no other frame has used."""
     handle = renderer.load(store)
     frame = renderer.render(view, handle, **STATE, merge=False)
     handle.release()
@@ -65,7 +47,7 @@ def rendered(renderer, view, store):
 
 
 def rows_of(renderer, view, name: str, mode: str) -> list[Row]:
-    """Building, and the frame's kernels, of one eye and mode."""
+    """Return the rows of building, and of a frame's kernels, of one eye and mode."""
     exact_spec = spec_for(
         mode=mode, max_blur_step_px=REFERENCE_STEP_PX, **SIZE, **THIS_STATE
     )
@@ -82,58 +64,34 @@ def rows_of(renderer, view, name: str, mode: str) -> list[Row]:
     frame = rendered(renderer, view, store)
     times_ms = frame.stage_times_ms
     error_db = psnr_db(frame.color, truth.color.astype(np.float64))
-    theirs = THEIRS[mode].format(*PAPER[name][mode == "dynamic"])
-
-    def row(method: str, setting: str, time_ms: float, memory_mb: float) -> Row:
-        return Row(
-            bench="layers",
-            method=method,
-            case=name,
-            setting=f"{mode}: {setting}; {theirs}",
-            n=1,
-            median_ms=time_ms,
-            p95_ms=time_ms,
-            memory_mb=memory_mb,
-            error_name="psnr_db",
-            error=error_db,
-            reference="frame through a finer cache of this state",
-        )
-
+    theirs = f"{LAYERS[name]} layers, {TEXTURE_MIB[name]} MB"
+    if mode == "dynamic":
+        theirs = f"{CACHE['cache_gib'][name]} GB cache, {CACHE['texture_mib'][name]} MB"
     return [
-        row("cache", f"{store.psf_count} PSFs", build_ms, store.memory_mb),
-        row(
-            "frame kernels",
-            f"{frame.kernel_count} kernels of {frame.layer_count} layers",
-            times_ms["psf_plan_ms"] + times_ms["psf_blend_ms"],
-            1e-6 * ATLAS_TEXEL_BYTES * frame.kernel_texel_count,
-        ),
+        row_of(
+            *("layers", method, name, f"{mode}: {setting}; theirs {theirs}", [time_ms]),
+            *("psnr_db", error_db, "frame through a finer cache of this state"),
+            used_mb=used_mb,
+        )
+        for method, setting, time_ms, used_mb in (
+            ("cache", f"{store.psf_count} PSFs", build_ms, store.memory_mb),
+            (
+                "frame kernels",
+                f"{frame.kernel_count} kernels of {frame.layer_count} layers",
+                times_ms["psf_plan_ms"] + times_ms["psf_blend_ms"],
+                1e-6 * ATLAS_TEXEL_BYTES * frame.kernel_texel_count,
+            ),
+        )
     ]
 
 
-def main() -> None:
-    """Run, print, and write tests/benchmarks/results/layers.json."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true", help="one eye")
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
-    parser.add_argument("--engine", choices=ENGINES, default=ENGINES[0])
-    arguments = parser.parse_args()
-    renderer = open_renderer(arguments.engine)
+def measure(run: Run) -> list[Row]:
+    """Return the rows of all eyes, or of one on the axis."""
+    renderer = NativeRenderer()
     view = scene_view("courtyard", width_px=1280, height_px=720)
-    eyes = ["emmetropia"] if arguments.quick else list(PAPER)
-    rows = [
+    return [
         row
-        for name in eyes
-        for mode in GRIDS
+        for name in (["emmetropia"] if run.is_quick else LAYERS)
+        for mode in (["on-axis"] if run.is_quick else GRIDS)
         for row in rows_of(renderer, view, name, mode)
     ]
-    content = report(rows, machine={**machine_info(), "renderer": renderer.name})
-    if arguments.json:
-        print(json.dumps(content))
-        return
-    print_rows(rows)
-    if not arguments.quick:
-        write_report("layers", content)
-
-
-if __name__ == "__main__":
-    main()

@@ -1,7 +1,5 @@
 """The published pipeline as one setting, beside the default, through six eyes.
 
-    python -m tests.benchmarks.bench_published [--quick] [--json]
-
 `EyeFilter` with ``pipeline="published"``, by default, and with the published grid and
 accumulation alone, in the paper's state, 5 mm and 0.5 dpt, of a part of *Primitives*.
 The error is that of linear light against the exact PSF of every pixel
@@ -9,11 +7,10 @@ The error is that of linear light against the exact PSF of every pixel
 the paper.  Times are of the processor, all threads together: until eye and PSFs of a
 first frame are ready (``prepare_ms``), and of a frame after that.
 
-A whole run writes results/published.json, and the pictures to
-tests/data/published_pipeline.npz, with which the tests compare those of the service.
+A whole run also writes the pictures to tests/data/published_pipeline.npz, with which
+the tests compare those of the service.
 """
 
-import argparse
 import sys
 import time
 from contextlib import ExitStack
@@ -29,11 +26,13 @@ from filter_service.filtering.shared_builder import open_inline_builder
 from filter_service.rendering.media_effects import linear_from_srgb, srgb_from_linear
 from tests.benchmarks.dense_reference import dense_reference
 from tests.benchmarks.field_methods import PERIPHERY, EyeBench, State
-from tests.benchmarks.harness import ROOT, Row, memory_mb, publish
+from tests.benchmarks.harness import ROOT, Row, Run
 from tests.benchmarks.image_measures import measures
 from tests.benchmarks.published_figures import CONDITIONS
+from tests.benchmarks.rows import row_of
 from tests.numerical.scene_frames import scene_view
 
+MINUTES = 8
 PICTURES = ROOT / "tests" / "data" / "published_pipeline.npz"
 SIZE, FOV_DEG = (128, 72), 12.0
 STATE = State(5.0, 0.5)
@@ -127,10 +126,10 @@ def run_method(
         prepared = eye_filter.prepared_stores[-1]
     error = measures(seen.color, exact)
     frame_ms = times_ms[1:]
-    row = PipelineRow(
-        *("published", method, case, f"{SIZE[0]}x{SIZE[1]} {STATE}", repeats),
-        *(float(np.median(frame_ms)), float(np.percentile(frame_ms, 95))),
-        *(memory_mb(), "psnr_db", error.psnr_db, "exact PSF of every pixel"),
+    row = row_of(
+        *("published", method, case, f"{SIZE[0]}x{SIZE[1]} {STATE}", frame_ms),
+        *("psnr_db", error.psnr_db, "exact PSF of every pixel"),
+        kind=PipelineRow,
         prepare_ms=times_ms[0] - float(np.median(frame_ms)),
         psf_count=prepared.store.computed_count,
         psnr_srgb8_db=error.psnr_srgb8_db,
@@ -153,32 +152,22 @@ def error_db(image: NDArray[np.uint8], reference: NDArray[np.uint8]) -> float:
     return measures(*(linear_from_srgb(a) for a in (image, reference))).psnr_db
 
 
-def main() -> int:
-    """Run the program; its exit code."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--quick", action="store_true", help="two eyes, few frames")
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
-    arguments = parser.parse_args()
+def measure(run: Run) -> list[Row]:
+    """Return the rows of six eyes or two, and write the pictures of six."""
     rows, pictures = [], {"published": [], "exact": []}
     for network in ("eye", "focus", "aberration"):
         load_network(network)
     run_method("emmetropia", "published", exact_picture("emmetropia"), repeats=1)
-    for case in QUICK_CONDITIONS if arguments.quick else CONDITIONS:
+    for case in QUICK_CONDITIONS if run.is_quick else CONDITIONS:
         print(f"{case} ...", file=sys.stderr, flush=True)
         exact = exact_picture(case)
         pictures["exact"].append(srgb_from_linear(exact))
         for method in METHODS:
-            repeats = QUICK_REPEATS if arguments.quick else REPEATS
+            repeats = QUICK_REPEATS if run.is_quick else REPEATS
             row, seen = run_method(case, method, exact, repeats=repeats)
             rows.append(row)
             if method == "published":
                 pictures[method].append(srgb_from_linear(seen))
-    is_whole = not arguments.quick
-    publish("published", rows, as_json=arguments.json, is_whole=is_whole)
-    if is_whole:
+    if not run.is_quick:
         np.savez_compressed(PICTURES, **{k: np.array(v) for k, v in pictures.items()})
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+    return rows

@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 
 from filter_service.constants import MIN_COVERAGE
 
-RULES = ("coverage", "clamp", "paper", "sum")
+RULES = ("coverage", "paper", "sum")
 
 
 class DepthSums:
@@ -16,8 +16,7 @@ class DepthSums:
     shape : (height, width)
     rule : str
         "coverage": the sources of one depth share what nearer ones leave free;
-        "clamp": each takes its weight while there is room; "paper": a weight is an
-        opacity; "sum": a plain weighted mean.
+        "paper": a weight is an opacity; "sum": a plain weighted mean.
     step_dpt : float
         Sources no farther apart are at one depth.
 
@@ -65,9 +64,7 @@ class DepthSums:
         if self._rule == "coverage":
             self._add_to_depth(here, weight, color, distance_dpt)
             return
-        if self._rule == "clamp":
-            weight = np.minimum(weight, 1.0 - coverage)
-        elif self._rule == "paper":
+        if self._rule == "paper":
             weight = weight * (1.0 - coverage)
         light += weight * color
         coverage += weight

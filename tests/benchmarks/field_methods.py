@@ -9,17 +9,14 @@ from filter_service.planning.grid import GridSpec
 from filter_service.psfs.store import build_psf_store
 from filter_service.rendering.frame import fill_missing_depth, object_dpt
 from filter_service.rgbd_view import RgbdView
-from tests.benchmarks.baseline_types import Filtered
-from tests.benchmarks.engines import counted_work
 from tests.benchmarks.frame_runs import WARM_UPS, timed_frames
-from tests.benchmarks.layered_baselines import barsky, celaya, gonzalez
+from tests.benchmarks.layered_baselines import Filtered, barsky, celaya, gonzalez
 from tests.benchmarks.paper_baselines import (
     paper_dynamic,
     paper_on_axis,
     paper_quality,
     predecessor,
 )
-from tests.benchmarks.published_figures import OFF_AXIS, ON_AXIS
 from tests.benchmarks.view_sources import EyeState
 from tests.grid_specs import grid_spec
 from tests.numerical.plan_cases import traced_eye
@@ -57,9 +54,6 @@ class Method:
         Which reference it aims at: one PSF per distance, or the whole visual field.
     any_state : bool
         Whether pupil and focus may be anything without a new preparation.
-    frozen : bool
-        Whether frames repeat one state, and what was made for it, in place of changing
-        it from frame to frame; the name then ends in `FROZEN`.
     timed : bool
         Whether its frames are timed, all alike: after a warm-up, several times.  Others
         are written to be right and not to be fast; their work is counted.
@@ -68,18 +62,7 @@ class Method:
     name: str
     on_axis: bool
     any_state: bool
-    frozen: bool = field(default=False, kw_only=True)
     timed: bool = field(default=True, kw_only=True)
-
-    @property
-    def published_name(self) -> str | None:
-        """What of the paper's tables stands beside this method."""
-        name = self.name.removesuffix(FROZEN)
-        if name in ON_AXIS:
-            return name
-        if self.name.startswith(("ours", "paper")):
-            return "paper on-axis" if self.on_axis else OFF_AXIS
-        return None
 
     def states(self, fixed: State, others: list[State]) -> list[State]:
         """States that it is measured in."""
@@ -103,13 +86,6 @@ class EyeBench:
         steps = np.ceil(nearest_dpt / DISTANCE_STEP_DPT)
         self._object_range_dpt = (0.0, float(DISTANCE_STEP_DPT * steps))
         self._stores = {}
-        self._runs = {}
-
-    def once(self, key: tuple, run) -> list:
-        """Return what ``run`` does, of this very key for the first time."""
-        if key not in self._runs:
-            self._runs[key] = run()
-        return self._runs[key]
 
     def spec(self, mode: str, **settings) -> GridSpec:
         """Spec for this camera and these depths."""
@@ -150,7 +126,6 @@ class EyeBench:
         for handle, _ in self._stores.values():
             handle.release()
         self._stores.clear()
-        self._runs.clear()
 
 
 @dataclass(frozen=True)
@@ -159,7 +134,6 @@ class Ours(Method):
 
     mode: str = "dynamic"
     grid: str = "planned"
-    accumulation: str = "coverage"
     tolerance: str = "normal"
 
     def settings(self, state: State) -> dict:
@@ -185,10 +159,7 @@ class Ours(Method):
             pupil_diameter_mm=state.pupil_mm,
             focus_dpt=state.focus_dpt,
             repeats=repeats,
-            frozen=self.frozen,
-            accumulation=self.accumulation,
         )
-        work = counted_work(bench.renderer, view, run.last)
         return [
             Filtered(
                 color=frame.color,
@@ -196,7 +167,6 @@ class Ours(Method):
                 render_ms=time_ms,
                 memory_mb=handle.store.memory_mb,
                 psf_count=handle.store.psf_count,
-                tap_count=0 if work is None else work.lit_count,
             )
             for frame, time_ms in zip(run.frames, run.times_ms, strict=True)
         ]
@@ -216,73 +186,34 @@ class Baseline(Method):
         A frame of another state needs its PSFs first: its time is that of both.
         """
 
-        def filtered() -> list:
-            if self.needs_whole_grid:
-                at = bench.grid_state(state)
-            else:
-                at = bench.exact_state(state, on_axis=self.on_axis)
-            count, first = (WARM_UPS + repeats, WARM_UPS) if self.timed else (1, 0)
-            options = dict(self.options)
-            return [self.function(view, at, **options) for _ in range(count)][first:]
-
-        key = (self.function, self.options, id(view), state, repeats)
-        results = bench.once(key, filtered)
-        if self.frozen:
-            return results
-        return [replace(r, render_ms=r.prepare_ms + r.render_ms) for r in results]
-
-
-QUALITY_WIDE = "ours quality wide"
-QUALITY_FINE = "ours quality wide fine"
-CLAMP_RULE = (("rule", "clamp"),)
-PAPER_RULE = (("rule", "paper"),)
-
-FROZEN = " frozen"
-
-
-def frozen(method: Method) -> Method:
-    """The same method where nothing changes between frames."""
-    return replace(method, name=method.name + FROZEN, frozen=True)
-
-
-OURS = (
-    Ours("ours on-axis", on_axis=True, any_state=False, mode="on-axis"),
-    Ours("ours on-axis wide", on_axis=True, any_state=True, mode="on-axis"),
-    Ours("ours quality", on_axis=False, any_state=False, mode="quality"),
-    Ours(QUALITY_WIDE, on_axis=False, any_state=True, mode="quality"),
-    Ours("ours dynamic", on_axis=False, any_state=True),
-    Ours("ours paper grid", on_axis=False, any_state=True, grid="paper"),
-    Ours("ours dynamic fine", on_axis=False, any_state=True, tolerance="fine"),
-    Ours(QUALITY_FINE, on_axis=False, any_state=True, mode="quality", tolerance="fine"),
-)
-CONVOLVED = (
-    Baseline("Barsky", True, False, barsky),
-    Baseline("Celaya", False, False, celaya),
-    Baseline("Gonzalez", False, False, gonzalez),
-)
+        if self.needs_whole_grid:
+            at = bench.grid_state(state)
+        else:
+            at = bench.exact_state(state, on_axis=self.on_axis)
+        count, first = (WARM_UPS + repeats, WARM_UPS) if self.timed else (1, 0)
+        found = [self.function(view, at, **dict(self.options)) for _ in range(count)]
+        return [replace(r, render_ms=r.prepare_ms + r.render_ms) for r in found[first:]]
 
 
 def _counted(name, *arguments, **options) -> Baseline:
     return Baseline(name, *arguments, **options, timed=False)
 
 
-ON_AXIS_TEXTURES = (
+PAPER_RULE = (("rule", "paper"),)
+METHODS = (
+    Ours("ours on-axis", on_axis=True, any_state=False, mode="on-axis"),
+    Ours("ours on-axis wide", on_axis=True, any_state=True, mode="on-axis"),
+    Ours("ours quality", on_axis=False, any_state=False, mode="quality"),
+    Ours("ours dynamic", on_axis=False, any_state=True),
+    Ours("ours dynamic fine", on_axis=False, any_state=True, tolerance="fine"),
+    Ours("ours paper grid", on_axis=False, any_state=True, grid="paper"),
+    Baseline("Barsky", True, False, barsky),
+    Baseline("Celaya", False, False, celaya),
+    Baseline("Gonzalez", False, False, gonzalez),
     _counted("predecessor", True, False, predecessor),
     _counted("paper on-axis", True, False, paper_on_axis),
-    _counted("paper clamp 1 tap", True, False, paper_on_axis, CLAMP_RULE),
     _counted("paper alpha 1 tap", True, False, paper_on_axis, PAPER_RULE),
-)
-FIELD_TEXTURES = (
     _counted("paper quality", False, False, paper_quality, (), True),
-    _counted("paper clamp 4 tap", False, False, paper_quality, CLAMP_RULE, True),
     _counted("paper alpha 4 tap", False, False, paper_quality, PAPER_RULE, True),
     _counted("paper dynamic", False, True, paper_dynamic, (), True),
-)
-METHODS = (
-    *OURS,
-    *map(frozen, OURS),
-    *CONVOLVED,
-    *map(frozen, CONVOLVED),
-    *ON_AXIS_TEXTURES,
-    *FIELD_TEXTURES,
 )

@@ -10,6 +10,7 @@ dark border.  The prior implementation's versions mirror the kernels, never inte
 """
 
 import math
+import time
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,7 +23,6 @@ from estimator.psf.compute import PsfBatch
 from filter_service.constants import MIN_COVERAGE
 from filter_service.planning.nodes import bracket_axis
 from filter_service.rgbd_view import RgbdView
-from tests.benchmarks.baseline_types import Filtered, Stopwatch
 from tests.benchmarks.view_sources import EyeState, linear_color, view_sources
 
 BARSKY_SLICE_COUNT = 41
@@ -34,6 +34,48 @@ GONZALEZ_GRID = (11, 11, 3)
 """PSFs over azimuth, elevation and distance (paper section 7.2.2)."""
 
 BYTES_PER_WEIGHT = 4
+
+
+@dataclass(frozen=True)
+class Filtered:
+    """A view filtered by a baseline, and what that took.
+
+    Attributes
+    ----------
+    color : (height, width, 3)
+        Linear light.
+    prepare_ms : float
+        PSFs and tables; once for an eye, pupil and focus.
+    render_ms : float
+        Per frame.
+    memory_mb : float
+        PSFs as the method keeps them, at the bytes a texel that it is published with.
+    psf_count : int
+    tap_count : int
+        PSF samples that the frame needs, without those that a tile reads beyond a PSF;
+        0 where nothing counts them, as with methods that convolve by FFT.
+    """
+
+    color: NDArray[np.float64]
+    prepare_ms: float
+    render_ms: float
+    memory_mb: float
+    psf_count: int
+    tap_count: int = 0
+
+
+class Stopwatch:
+    """Wall time of consecutive stages."""
+
+    def __init__(self):
+        self._start_s = time.perf_counter()
+
+    def lap_ms(self) -> float:
+        """Time since the last call, or since the start."""
+        now_s = time.perf_counter()
+        lap_ms = 1e3 * (now_s - self._start_s)
+        self._start_s = now_s
+        return lap_ms
 
 
 def barsky(

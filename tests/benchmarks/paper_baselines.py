@@ -1,11 +1,9 @@
 """The paper's renderer and its predecessor's on the processor: splats from textures.
 
 What is compared is how PSFs are laid out and interpolated: every source is splat near
-to far as in the dense reference, and by its rule of coverage.  Two more rules are rows
-of their own: coverage where each single source takes what it wants until a pixel is
-full ("clamp"), and the paper's alpha.  Tiles and merging only save time, so they are
-left out: these rows scatter over all cores, and `tap_count` says how many samples the
-layout reads.
+to far as in the dense reference, by its rule of coverage or by the paper's alpha.
+Tiles and merging only save time, so they are left out, and `tap_count` says how many
+samples the layout reads.
 """
 
 from dataclasses import replace
@@ -15,9 +13,9 @@ from numpy.typing import NDArray
 
 from filter_service.planning.nodes import bracket_axis
 from filter_service.rgbd_view import RgbdView
-from tests.benchmarks.baseline_types import Filtered, Stopwatch
 from tests.benchmarks.dense_reference import depth_step_dpt
 from tests.benchmarks.depth_sums import DepthSums
+from tests.benchmarks.layered_baselines import Filtered, Stopwatch
 from tests.benchmarks.paper_layout import (
     BYTES_PER_TEXEL,
     DYNAMIC,
@@ -30,9 +28,9 @@ from tests.benchmarks.paper_layout import (
 from tests.benchmarks.resized_psfs import full_radius_px, resized
 from tests.benchmarks.view_sources import EyeState, Sources, linear_color, view_sources
 
-RULES = ("coverage", "clamp", "paper")
-"""How sources add up: those of one depth share what nearer ones leave free; each takes
-what it wants while there is room; or a weight is an opacity."""
+RULES = ("coverage", "paper")
+"""How sources add up: those of one depth share what nearer ones leave free, or a weight
+is an opacity."""
 
 PREDECESSOR_TAPS = 6
 ON_AXIS_TAPS = 1

@@ -63,9 +63,9 @@ class Measured:
         ]
 
     def value(self, name: str, column: str, **wanted) -> float | None:
-        """One field of the first such row; None where there is none."""
+        """One field of the first such row; None where there is none, or it is NaN."""
         for row in self.rows(name, **wanted):
-            if row[column] is not None:
+            if row[column] is not None and row[column] == row[column]:
                 return row[column]
         return None
 
