@@ -218,9 +218,8 @@ def plot_errors(rows: list[FieldRow], path: Path) -> None:
                 own = [row for row in rows if row.method == name]
             points = sorted(median_points(own, column))
             if points:
-                axes.loglog(
-                    *zip(*points, strict=True), "o-", c=colors[name], label=name
-                )
+                (line,) = axes.loglog(*zip(*points, strict=True), "o-", c=colors[name])
+                line.set_label(name)
         axes.set(xlabel=label, ylabel="RMS error, linear light")
         axes.grid(which="both", alpha=0.3)
         axes.legend(fontsize="x-small")

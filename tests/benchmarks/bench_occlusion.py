@@ -2,8 +2,8 @@
 
 Usage: python -m tests.benchmarks.bench_occlusion [--quick] [--json] [--engine NAME]
 
-Error: PSNR in linear light against rays through a thin lens (`tests.reference.lens_picture`), over the
-whole picture, and over the band that light from both sides of an edge reaches.  The eye
+Error: PSNR in linear light against rays through a thin lens
+(`tests.reference.lens_picture`), over the whole picture, and over the band that light from both sides of an edge reaches.  The eye
 has no aberrations but defocus, for that is what the reference has.  Fragments are not
 merged, for that has an error of its own, edges or not; one method has them merged.
 """

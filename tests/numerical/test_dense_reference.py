@@ -359,6 +359,6 @@ def test_an_error_of_a_tenth_of_white_is_20_db(rng):
     image = rng.random((20, 30, 3))
     assert measures(image + 0.1, image).psnr_db == pytest.approx(20.0)
     # 8-bit sRGB of 0.2140 and 0.2159 is 127 and 128
-    dark, bright = np.full((2, 4, 4, 3), 0.2140) + [[[[0.0]]], [[[0.0019]]]]
+    dark, bright = (np.full((4, 4, 3), light) for light in (0.2140, 0.2159))
     step_db = -20.0 * np.log10(1.0 / 255.0)
     assert measures(dark, bright).psnr_srgb8_db == pytest.approx(step_db)
