@@ -78,7 +78,7 @@ validate: setup-test setup-web  ## run the slow tests and every benchmark; write
 	    || test $$? -eq 77 # where there can be no chroot
 
 witness: setup-witness  ## compare frames with a path tracer that renders through the same eyes
-	$(PYTHON) -m tests.benchmarks.bench_witness $(ARGS)
+	$(PYTHON) -m tests.benchmarks witness $(ARGS)
 
 peers: setup-peers  ## compare with alternatives such as optiland and DeepLens (6 GB)
 	$(PYTHON) -m tests.benchmarks.bench_peers $(ARGS)

@@ -1,15 +1,11 @@
 """Best focus of eyes compared with the requested focus, by forward ray tracing.
 
-    python -m tests.benchmarks.bench_focus [--quick] [--json]
-
 Every eye is asked, as a frame asks it, to look at distances through pupils of 2 to 7
 mm.  Rays from points at many distances then run inwards to the retina: error is how far
 the distance of the smallest RMS wavefront lies from the focus that the eye reported.
-Beside it stands the distance of the largest visual Strehl ratio, the criterion not
-taken.  Far points are those of both eye models.  Writes results/focus.json.
+Far points are those of both eye models.
 """
 
-import argparse
 import time
 
 import numpy as np
@@ -20,8 +16,10 @@ from estimator.optics.units import RGB_WAVELENGTHS_NM
 from estimator.profiles.measured_wavefront import MeasuredWavefront
 from estimator.profiles.parse import EyeProfile, parse_profile, preset_names
 from tests.benchmarks.forward_rays import WAVELENGTH_NM, ForwardEye
-from tests.benchmarks.harness import Row, memory_mb, publish
+from tests.benchmarks.harness import Row, Run
+from tests.benchmarks.rows import row_of
 
+MINUTES = 20
 PUPILS_MM = (2.0, 3.0, 4.0, 5.0, 6.0, 7.0)
 FOCI_DPT = (0.0, 1.5, 3.0, 4.5, 6.0)
 SPHERES_DPT = (-6.0, 0.0, 4.0)
@@ -46,10 +44,9 @@ def profiles() -> dict[str, EyeProfile]:
     return found
 
 
-def _row(method, case, setting, n, time_ms, name, error) -> Row:
-    return Row(
-        *("focus", method, case, setting, n, time_ms, time_ms, memory_mb()),
-        *(name, float(error), REFERENCE),
+def _row(method, case, setting, times_ms, name, error, **more) -> Row:
+    return row_of(
+        *("focus", method, case, setting, times_ms, name, error, REFERENCE), **more
     )
 
 
@@ -63,13 +60,13 @@ def prepared(eye: EstimatedEye) -> TracedEye:
     )
 
 
-def focus_rows(name: str, profile: EyeProfile, *, with_visual: bool) -> list[Row]:
+def focus_rows(name: str, profile: EyeProfile, pupils_mm, foci_dpt) -> list[Row]:
     """A row for each pupil and focus."""
     estimated = estimate_eye(profile)
     eye, rows = prepared(estimated), []
     rest = estimated.rest(WAVELENGTH_NM)
-    for pupil_mm in PUPILS_MM:
-        for focus_dpt in FOCI_DPT:
+    for pupil_mm in pupils_mm:
+        for focus_dpt in foci_dpt:
             asked = {"focus_dpt": focus_dpt, "pupil_diameter_mm": pupil_mm}
             started_s = time.perf_counter()
             used_dpt = eye.accommodation_dpt(**asked)
@@ -86,16 +83,8 @@ def focus_rows(name: str, profile: EyeProfile, *, with_visual: bool) -> list[Row
             reaches = abs(said_dpt - focus_dpt) <= REACH_MARGIN_DPT
             method = "in reach" if reaches else "end of reach"
             rows.append(
-                _row(method, name, setting, 1, time_ms, "best focus, dpt", error_dpt)
+                _row(method, name, setting, [time_ms], "best focus, dpt", error_dpt)
             )
-            if with_visual:
-                visual_dpt = forward.visually_sharpest_dpt(said_dpt) - said_dpt
-                rows.append(
-                    _row(
-                        *("visual Strehl", name, setting, 1, time_ms),
-                        *("best focus, dpt", visual_dpt),
-                    )
-                )
     return rows
 
 
@@ -117,12 +106,8 @@ def far_point_rows(name: str, profile: EyeProfile) -> list[Row]:
             ("measured wavefront", other_dpt),
             ("forward rays", forward.sharpest_dpt(far_dpt)),
         ):
-            rows.append(
-                _row(
-                    *(method, name, setting, 1, 0.0),
-                    *("far point, dpt", against_dpt - far_dpt),
-                )
-            )
+            error_dpt = against_dpt - far_dpt
+            rows.append(_row(method, name, setting, [], "far point, dpt", error_dpt))
     return rows
 
 
@@ -132,30 +117,18 @@ def summary_rows(rows: list[Row]) -> list[Row]:
     for method in dict.fromkeys(row.method for row in rows):
         own = [row for row in rows if row.method == method]
         errors = np.abs([row.error for row in own])
-        times_ms = float(np.median([row.median_ms for row in own]))
+        times_ms = [row.median_ms for row in own]
         for label, value in (("median", np.median(errors)), ("largest", errors.max())):
             found.append(
-                _row(
-                    *(method, "all eyes", label, len(own), times_ms),
-                    *(own[0].error_name, value),
-                )
+                _row(method, "all eyes", label, times_ms, own[0].error_name, value)
             )
     return found
 
 
-def main() -> None:
-    """Run from the command line."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true", help="no visual Strehl ratio")
-    parser.add_argument("--json", action="store_true", help="print the report alone")
-    options = parser.parse_args()
+def measure(run: Run) -> list[Row]:
+    """Return the rows of all eyes, or of one with one pupil and focus."""
     rows = []
-    for name, profile in profiles().items():
-        rows += focus_rows(name, profile, with_visual=not options.quick)
-        rows += far_point_rows(name, profile)
-    rows = summary_rows(rows) + rows
-    publish("focus", rows, as_json=options.json, is_whole=not options.quick)
-
-
-if __name__ == "__main__":
-    main()
+    for name, profile in [*profiles().items()][: 1 if run.is_quick else None]:
+        asked = ((4.0,), (1.5,)) if run.is_quick else (PUPILS_MM, FOCI_DPT)
+        rows += focus_rows(name, profile, *asked) + far_point_rows(name, profile)
+    return summary_rows(rows) + rows

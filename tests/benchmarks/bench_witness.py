@@ -1,24 +1,18 @@
 """Frames compared with a path tracer through the surfaces of the same eye.
 
-    make witness
-    python -m tests.benchmarks.bench_witness [--quick] [--json] [--python PROGRAM]
-
-Mitsuba (Jakob et al. 2022; a Python of its own, `witness_script`) sends rays from the
-retina through cornea and lens into a scene, and takes the picture of a pinhole beside
-it, with distances and what is hidden.  That is what `EyeFilter` is given.  Error: PSNR
-in linear light, over all pixels; near edges that light of both sides reaches; and over
-the rest, by how far from the axis it lies.  Beside ours: the picture unfiltered, the
-tracer with half of its samples, the eye seen as if all directions were the axis, the
-frame without lateral colour, and ours of a picture that follows each direction's chief
-ray: off the axis these pass beside the pinhole, by which near things move.  Writes
-results/witness.json and witness.jpg.
+`make witness` sets up the tracer and runs this.  Mitsuba (Jakob et al. 2022; a Python
+of its own, `witness_script`) sends rays from the retina through cornea and lens into a
+scene, and takes the picture of a pinhole beside it, with distances and what is hidden.
+That is what `EyeFilter` is given.  Error: PSNR in linear light, over all pixels; near
+edges that light of both sides reaches; and over the rest, by how far from the axis it
+lies.  Beside ours: the picture unfiltered, the tracer with half of its samples, the eye
+seen as if all directions were the axis, and the frame without lateral color.
 
 The tracer knows no diffraction (pupils here are 5 mm, their blur 0.14 mrad, a pixel
 1.8) and no wavefront: it shares with us the eye's radii, distances and indices, the
 place of the pinhole, and the size of the iris.
 """
 
-import argparse
 import hashlib
 import json
 import os
@@ -44,26 +38,18 @@ from filter_service.displays import display_wavelengths_nm
 from filter_service.filtering.eye_filter import EyeFilter
 from filter_service.rgbd_view import RgbdView
 from filter_service.settings import FilterSettings
+from tests.benchmarks.bench_occlusion import Scene
 from tests.benchmarks.forward_rays import ForwardEye
-from tests.benchmarks.harness import (
-    OUT,
-    RESULTS,
-    ROOT,
-    Row,
-    machine_info,
-    memory_mb,
-    print_rows,
-    report,
-    write_report,
-)
-from tests.benchmarks.occlusion_scenes import Scene
+from tests.benchmarks.harness import OUT, ROOT, Row, Run
+from tests.benchmarks.rows import row_of
 from tests.numerical.synthetic import psnr_db
 
+MINUTES = 60
 SOURCES = tuple(
     Path(__file__).with_name(name) for name in ("witness_script.py", "witness_eye.py")
 )
 CACHE = OUT / "witness"
-DEFAULT_PYTHON = ROOT / ".witness" / "bin" / "python"
+PYTHON = ROOT / ".witness" / "bin" / "python"
 LEAST_LLVM = 16
 """Of a machine without a GPU: older ones do not compile what Dr.Jit asks for."""
 
@@ -148,7 +134,7 @@ def _indices(surfaces: EyeSurfaces, wavelength_nm: float) -> list[float]:
     return media_indices(surfaces, wavelength_nm).tolist()
 
 
-def traced_picture(program: Path, job: dict) -> dict[str, NDArray]:
+def traced_picture(job: dict) -> dict[str, NDArray]:
     """Return what `witness_script` makes of a job, once made.
 
     Raises
@@ -161,12 +147,12 @@ def traced_picture(program: Path, job: dict) -> dict[str, NDArray]:
     made_from = hashlib.sha256(sources + text.encode()).hexdigest()
     found = CACHE / f"{made_from}.npz"
     if not found.exists():
-        _trace(program, text, found)
+        _trace(text, found)
     with np.load(found) as arrays:
         return dict(arrays)
 
 
-def _trace(program: Path, job: str, found: Path) -> None:
+def _trace(job: str, found: Path) -> None:
     found.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as name:
         written, unfinished = Path(name) / "job.json", Path(name) / "found.npz"
@@ -177,7 +163,7 @@ def _trace(program: Path, job: str, found: Path) -> None:
             environment.setdefault("DRJIT_LIBLLVM_PATH", str(library))
         try:
             ended = subprocess.run(
-                (program, SOURCES[0], written, unfinished),
+                (PYTHON, SOURCES[0], written, unfinished),
                 env=environment,
                 capture_output=True,
                 text=True,
@@ -189,7 +175,7 @@ def _trace(program: Path, job: str, found: Path) -> None:
             ) from None
         if ended.returncode != 0:
             raise SystemExit(
-                f"{program} failed ({ended.returncode}); it needs the packages mitsuba "
+                f"{PYTHON} failed ({ended.returncode}); it needs the packages mitsuba "
                 f"and numpy, and LLVM {LEAST_LLVM} or newer:\n{ended.stderr[-2000:]}"
             )
         shutil.copyfile(unfinished, found)
@@ -208,7 +194,7 @@ def newest_llvm() -> Path | None:
 class Witnessed:
     """A case as the tracer sees it, and regions to compare in."""
 
-    def __init__(self, case: Case, *, program: Path, width_px: int, samples: int):
+    def __init__(self, case: Case, *, width_px: int, samples: int):
         self.case = case
         estimated = estimate_eye(parse_profile(case.profile))
         parameters = estimated.parameters.to_mapping()
@@ -219,7 +205,6 @@ class Witnessed:
         )
         camera = self.camera
         self.found = traced_picture(
-            program,
             {
                 "scene": case.scene,
                 "samples": samples,
@@ -233,10 +218,10 @@ class Witnessed:
         )
         self.truth = self.found["seen"]
 
-    def view(self, *, layers: int = 2, taken: str = "") -> RgbdView:
-        """Return the pinhole's picture, or with ``chief_`` that along chief rays."""
+    def view(self, *, layers: int = 2) -> RgbdView:
+        """Return the pinhole's picture."""
         arrays = {
-            name: self.found[taken + name].astype(np.float32)
+            name: self.found[name].astype(np.float32)
             for name in ("color", "depth_m", "hidden_color", "hidden_depth_m")
         }
         if layers == 1 or not (arrays["hidden_depth_m"] > 0.0).any():
@@ -267,12 +252,12 @@ class Witnessed:
         """Return a row for each region."""
         camera = self.camera
         return [
-            Row(
+            row_of(
                 *("witness", method, self.case.name),
-                f"{camera.width_px}x{camera.height_px}, {name}",
-                *(int(mask.sum()), float(np.median(times_ms)), max(times_ms)),
-                *(memory_mb(), "psnr_db", psnr_db(picture[mask], self.truth[mask])),
+                *(f"{camera.width_px}x{camera.height_px}, {name}", times_ms),
+                *("psnr_db", psnr_db(picture[mask], self.truth[mask])),
                 f"Mitsuba {self.found['version']}",
+                n=int(mask.sum()),
             )
             for name, mask in self.regions().items()
             if mask.any()
@@ -280,11 +265,11 @@ class Witnessed:
 
 
 def filtered(
-    witnessed: Witnessed, *, layers: int = 2, taken: str = "", **settings
+    witnessed: Witnessed, *, layers: int = 2, **settings
 ) -> tuple[NDArray, list[float]]:
     """Return our frame, and times of frames whose state stays."""
     case = witnessed.case
-    view = witnessed.view(layers=layers, taken=taken)
+    view = witnessed.view(layers=layers)
     chosen = FilterSettings(
         **{"lateral_color": True, **settings},
         pupil_range_mm=(PUPIL_MM, PUPIL_MM),
@@ -309,69 +294,24 @@ def filtered(
 OURS = {
     "two layers": {},
     "one layer": {"layers": 1},
-    "along chief rays": {"taken": "chief_"},
-    "no lateral colour": {"lateral_color": False},
+    "no lateral color": {"lateral_color": False},
     "on the axis": {"mode": "on-axis", "lateral_color": False},
 }
 
 
-def case_rows(witnessed: Witnessed) -> tuple[list[Row], NDArray]:
-    """Return rows of all methods, and our best picture."""
-    found = witnessed.found
-    tracer_ms = 1e3 * float(found["seconds"])
-    rows = witnessed.rows("unfiltered", found["color"].astype(np.float64), [0.0])
-    rows += witnessed.rows("half the samples", found["seen_by_half"], [tracer_ms / 2])
-    best = None
-    for method, options in OURS.items():
-        picture, times_ms = filtered(witnessed, **options)
-        best = picture if best is None else best
-        rows += witnessed.rows(method, picture, times_ms)
-    return rows, best
-
-
-def panel(witnessed: Witnessed, ours: NDArray) -> NDArray[np.uint8]:
-    """Return the pinhole's, the tracer's and our picture, and ten times the error."""
-    error = np.clip(10.0 * np.abs(ours - witnessed.truth), 0.0, 1.0)
-    shown = [witnessed.found["color"], witnessed.truth, ours]
-    pictures = [np.clip(p, 0.0, 1.0) ** (1.0 / 2.2) for p in shown]
-    return (255.0 * np.concatenate([*pictures, error], axis=1) + 0.5).astype(np.uint8)
-
-
-def main() -> None:
-    """Run, print, and write results/witness.json and results/witness.jpg."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true", help="small and noisy")
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
-    parser.add_argument(
-        "--python", type=Path, default=DEFAULT_PYTHON, help="one that has Mitsuba"
-    )
-    options = parser.parse_args()
-    from PIL import Image
-
-    width_px, samples = (160, 16) if options.quick else (640, 256)
-    rows, panels = [], []
-    for case in CASES[:2] if options.quick else CASES:
-        print(f"{case.name}: {samples} rays a pixel and colour", file=sys.stderr)
-        witnessed = Witnessed(
-            case, program=options.python, width_px=width_px, samples=samples
+def measure(run: Run) -> list[Row]:
+    """Return the rows of all cases, or of two small and noisy ones."""
+    rows = []
+    width_px, samples = (160, 16) if run.is_quick else (640, 256)
+    for case in CASES[:2] if run.is_quick else CASES:
+        print(f"{case.name}: {samples} rays a pixel and color", file=sys.stderr)
+        witnessed = Witnessed(case, width_px=width_px, samples=samples)
+        found = witnessed.found
+        tracer_ms = 1e3 * float(found["seconds"])
+        rows += witnessed.rows("unfiltered", found["color"].astype(np.float64), [])
+        rows += witnessed.rows(
+            "half the samples", found["seen_by_half"], [tracer_ms / 2]
         )
-        found, picture = case_rows(witnessed)
-        rows += found
-        panels.append(panel(witnessed, picture))
-    folder = OUT if options.quick else RESULTS
-    folder.mkdir(parents=True, exist_ok=True)
-    image = Image.fromarray(np.concatenate(panels))
-    image.resize((1280, image.height * 1280 // image.width)).save(
-        folder / "witness.jpg", quality=82
-    )
-    content = report(rows, machine={**machine_info(), "tracer": rows[0].reference})
-    if not options.quick:
-        write_report("witness", content)
-    if options.json:
-        print(json.dumps(content))
-    else:
-        print_rows(rows)
-
-
-if __name__ == "__main__":
-    main()
+        for method, options in OURS.items():
+            rows += witnessed.rows(method, *filtered(witnessed, **options))
+    return rows

@@ -15,7 +15,7 @@ from estimator.optics.media import refractive_index
 from estimator.optics.paraxial import entrance_pupil_mm
 from estimator.optics.raytrace import RayStatus, TracedRays, trace_rays
 from estimator.optics.surfaces import EyeSurfaces
-from estimator.optics.units import MM_PER_M, NM_PER_UM, UM_PER_MM
+from estimator.optics.units import MM_PER_M, UM_PER_MM
 from estimator.optics.zernike import EXPONENTS
 from tests.numerical.spot_focus import hexagonal_disc
 
@@ -35,10 +35,6 @@ WAVELENGTH_NM = 555.0
 
 SEARCH_DPT = 1.5
 """To either side of the focus asked for."""
-
-SHARPNESS_STEP_DPT = 0.05
-PUPIL_SAMPLES = 64
-POLYNOMIAL_DEGREE = 8
 
 
 @dataclass(frozen=True)
@@ -148,33 +144,6 @@ class ForwardEye:
         """Root mean square of the wavefront from a distance."""
         return float(np.sqrt(np.mean(self.wavefront_um(object_dpt)[1] ** 2)))
 
-    def sharpness_ratio(self, object_dpt: float) -> float:
-        """Visual Strehl ratio of a distance: the transfer function as people weigh it.
-
-        Weights are the contrast sensitivity of ModelFest's observers (Watson & Ahumada
-        2005, HPmH), cycles per degree.
-        """
-        unit, w_um = self.wavefront_um(object_dpt)
-        powers = [
-            (a, n - a) for n in range(POLYNOMIAL_DEGREE + 1) for a in range(n + 1)
-        ]
-        terms = np.linalg.lstsq(_monomials(unit, powers), w_um, rcond=None)[0]
-        side = np.linspace(-1.0, 1.0, PUPIL_SAMPLES)
-        grid = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
-        phase = (
-            2.0 * np.pi * NM_PER_UM / WAVELENGTH_NM * (_monomials(grid, powers) @ terms)
-        )
-        inside = np.hypot(*grid.T) <= 1.0
-        shape = (PUPIL_SAMPLES, PUPIL_SAMPLES)
-        perfect, real = (
-            _transfer((inside * np.exp(1j * w)).reshape(shape)) for w in (0.0, phase)
-        )
-        step_mm = self.pupil_diameter_mm * (side[1] - side[0]) / 2.0
-        shift_mm = step_mm * np.fft.fftfreq(len(real), 1.0 / len(real))
-        cpd = np.hypot(*np.meshgrid(shift_mm, shift_mm)) / (WAVELENGTH_NM * 1e-6)
-        weight = _contrast_sensitivity(np.radians(1.0) * cpd)
-        return float((weight * real).sum() / (weight * perfect).sum())
-
     def sharpest_dpt(self, near_dpt: float) -> float:
         """Distance of the smallest RMS, about one."""
         return float(
@@ -185,12 +154,6 @@ class ForwardEye:
                 options={"xatol": 1e-5},
             ).x
         )
-
-    def visually_sharpest_dpt(self, near_dpt: float) -> float:
-        """Distance of the largest visual Strehl ratio, about one."""
-        steps = np.arange(-SEARCH_DPT / 2.0, SEARCH_DPT / 2.0, SHARPNESS_STEP_DPT)
-        ratios = [self.sharpness_ratio(near_dpt + step) for step in steps.tolist()]
-        return float(near_dpt + steps[int(np.argmax(ratios))])
 
 
 def _taken(rays: TracedRays, which: NDArray[np.bool_]) -> TracedRays:
@@ -206,20 +169,3 @@ def _taken(rays: TracedRays, which: NDArray[np.bool_]) -> TracedRays:
         ),
         rays.stop_index,
     )
-
-
-def _monomials(points: NDArray, powers: list[tuple[int, int]]) -> NDArray[np.float64]:
-    x, y = points.T
-    return np.column_stack([x**a * y**b for a, b in powers])
-
-
-def _transfer(pupil: NDArray[np.complex128]) -> NDArray[np.float64]:
-    """Real part of the transfer function, zero shift first."""
-    twice = tuple(2 * n for n in pupil.shape)
-    found = np.fft.ifft2(np.abs(np.fft.fft2(pupil, twice)) ** 2).real
-    return found / found[0, 0]
-
-
-def _contrast_sensitivity(cpd: NDArray[np.float64]) -> NDArray[np.float64]:
-    high = 1.0 / np.cosh((cpd / 4.1726) ** 0.7786)
-    return 373.08 * (high - 0.8493 / np.cosh(np.minimum(cpd / 1.3625, 700.0)))

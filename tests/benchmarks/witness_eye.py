@@ -190,7 +190,7 @@ class Eye:
 
     def chief_rays(self, tangent_x, tangent_y, indices):
         """Where rays of directions in the picture, through the middle of the stop,
-        pass the plane of the entrance pupil, and where they meet the retina.
+        meet the retina.
         """
         direction = -dr.normalize(mi.Vector3d(tangent_x, tangent_y, -1.0))
         x, y = dr.zeros(mi.Float64, dr.width(tangent_x)), 0.0
@@ -200,8 +200,7 @@ class Eye:
             x, y = x - at_stop.x, y - at_stop.y
             dr.eval(x, y)
         start = self._start(x, y, direction)
-        _, on_retina = self.inwards(start, direction, indices)
-        return mi.Vector3d(x, y, self.pupil_z_mm), on_retina
+        return self.inwards(start, direction, indices)[1]
 
     def _start(self, x, y, direction):
         through = mi.Vector3d(x, y, self.pupil_z_mm)

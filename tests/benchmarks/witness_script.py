@@ -195,13 +195,10 @@ class Pixels:
         return array.reshape(*array.shape[:-1], self.height, self.width)
 
 
-def shot(scene, pixels, u, v, starts):
+def shot(scene, pixels, u, v):
     """What rays through places within the pixels meet, and what is behind it."""
     x, y = pixels.tangents(mi.Float(pixels.column) + u, mi.Float(pixels.row) + v)
-    start = mi.Point3f(0.0)
-    if starts is not None:
-        start = mi.Point3f(pixels.between(starts, u, v))
-    ray = mi.Ray3f(start, dr.normalize(mi.Vector3f(x, y, -1.0)))
+    ray = mi.Ray3f(mi.Point3f(0.0), dr.normalize(mi.Vector3f(x, y, -1.0)))
     first = scene.ray_intersect(ray)
     behind, seen = scene.ray_intersect(first.spawn_ray(ray.d)), first.shape
     for _ in range(SKIPPED):
@@ -211,12 +208,8 @@ def shot(scene, pixels, u, v, starts):
     return first, behind
 
 
-def pinhole(scene, pixels, starts=None):
-    """Colour, distance, and both of what is behind, as arrays.
-
-    Rays come from the pinhole, or, for a picture that no camera takes, from places
-    known at the pixels' corners.
-    """
+def pinhole(scene, pixels):
+    """Color, distance, and both of what is behind, as arrays."""
     count = pixels.width * pixels.height
     colors = [dr.zeros(mi.Color3f, count) for _ in range(2)]
     hits = [dr.zeros(mi.Float, count) for _ in range(2)]
@@ -224,12 +217,12 @@ def pinhole(scene, pixels, starts=None):
     for v in offsets:
         for u in offsets:
             places = (dr.opaque(mi.Float, u), dr.opaque(mi.Float, v))
-            for k, si in enumerate(shot(scene, pixels, *places, starts)):
+            for k, si in enumerate(shot(scene, pixels, *places)):
                 colors[k] += radiance(scene, si)
                 hits[k] += dr.select(si.is_valid(), 1.0, 0.0)
             dr.eval(colors, hits)
     found = {}
-    middle = shot(scene, pixels, mi.Float(0.5), mi.Float(0.5), starts)
+    middle = shot(scene, pixels, mi.Float(0.5), mi.Float(0.5))
     for k, (name, si) in enumerate(zip(("", "hidden_"), middle, strict=True)):
         mean = colors[k] / dr.maximum(hits[k], 1.0)
         distance = dr.select(si.is_valid(), dr.norm(si.p), 0.0)
@@ -285,14 +278,9 @@ def main():
     scene = mi.load_dict({"type": "scene", **SCENES[job["scene"]]()})
     pixels, given = Pixels(job["camera"]), job["eye"]
     eye = Eye(given)
-    passes, places = eye.chief_rays(
-        *pixels.corner_tangents(), given["reference_indices"]
-    )
-    dr.eval(passes, places)
-    starts = (passes - mi.Vector3d(0.0, 0.0, eye.pupil_z_mm)) / MM_PER_M
+    places = eye.chief_rays(*pixels.corner_tangents(), given["reference_indices"])
+    dr.eval(places)
     found = pinhole(scene, pixels)
-    by_chief_rays = pinhole(scene, pixels, starts)
-    found |= {"chief_" + name: array for name, array in by_chief_rays.items()}
     start_s = time.perf_counter()
     found["seen"], found["seen_by_half"] = through_eye(
         scene, pixels, eye, given["channel_indices"], places, job["samples"]
