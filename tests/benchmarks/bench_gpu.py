@@ -1,12 +1,9 @@
 """Frame time on a hardware GPU, of arrays and of textures, with image error.
 
-    python -m tests.benchmarks.bench_gpu [--quick] [--json] [--views NAME ...]
-
 The courtyard over the whole visual field ("dynamic"), 8-bit sRGB in and out, one eye or
 two of a headset.  "moving": pupil and focus change with every frame, so that its
 kernels are blended anew; "frozen": they stay.  Frames come one after the other for a
-while before any is timed, for a GPU that rests lowers its clock; the clocks stand with
-the machine, where nvidia-smi tells them.
+while before any is timed, because an idle GPU lowers its clock.
 
 Color and depth in host memory:
 
@@ -27,21 +24,30 @@ Error: PSNR in linear light against the native engine, whose loops have no code 
 common with the passes; its own error against the dense reference is in live.json.
 Images in textures have half floats for it.
 
-Rows go to out/gpu_rows.jsonl as they come, for runs that are ended early.  Writes
-results/gpu.json on hardware.
+Rows go to out/gpu_rows.jsonl as they come, for runs that are ended early.  A whole run
+needs a hardware GPU; ``--quick`` runs on any.
+
+``--forecast`` needs none: a forecast, not a measurement, of passes on the GPU of
+gpu.json, for frames whose state stays.  It counts the work of each pass as the code now
+does it and divides its bound by the mean ratio of bound to time of the measured passes.
+The error is the relative deviation from the measured passes, each eye forecast from the
+other eyes, and so includes what the code has changed since.
 """
 
-import argparse
 import json
 import sys
 import time
+from argparse import ArgumentParser
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 
 from filter_service.gl.gpu import Gpu
+from filter_service.rendering.gl.list_passes import ListPasses
+from filter_service.rendering.gl.renderer import FilterRenderer
 from tests.benchmarks.frame_runs import states_towards
 from tests.benchmarks.gpu_cases import (
     EYES,
@@ -49,22 +55,31 @@ from tests.benchmarks.gpu_cases import (
     PUPIL_MM,
     QUICK_VIEWS,
     REFERENCE,
+    STATE,
     VIEWS,
     Case,
     TextureCase,
     open_case,
+    view_and_store,
 )
 from tests.benchmarks.harness import (
+    RESULTS,
     KeptRows,
     Row,
-    machine_info,
+    Run,
+    memory_mb,
     nvidia_smi,
-    print_rows,
-    report,
-    write_report,
 )
-from tests.benchmarks.pass_work import STATE_STAGES, Rates, rates_of
+from tests.benchmarks.pass_work import (
+    RATES,
+    STATE_STAGES,
+    FrameWork,
+    Rates,
+    counted_work,
+    rates_of,
+)
 
+MINUTES = 4
 QUICK_NAMES = dict(zip(VIEWS, ("192x108", "192x108", "2 x 96x100"), strict=True))
 """The small view that stands for a large one."""
 HOST_STAGES = ("prepare_ms", "psf_plan_ms", "plan_ms", "upload_ms", "readback_ms")
@@ -218,45 +233,100 @@ def case_rows(gpu: Gpu, case: Case, pace: Pace) -> Iterator[Row]:
         yield from Rows(case, rates, is_moving=is_moving).of(times_ms)
 
 
-def chosen_views(names: list[str], *, is_quick: bool) -> dict:
-    """Sizes and numbers of views, or of the small ones that stand for them."""
-    if not is_quick:
-        return {name: VIEWS[name] for name in names}
-    return {QUICK_NAMES[name]: QUICK_VIEWS[QUICK_NAMES[name]] for name in names}
+def counted_frame(gpu: Gpu, eye: str, size_px: tuple[int, int]) -> FrameWork:
+    """Return the work of a view; the splat, from which no pass reads, is left out."""
+    renderer = FilterRenderer(gpu)
+    view, store = view_and_store(eye, size_px)
+    handle = renderer.load(store)
+    with patch.object(ListPasses, "_splat", lambda *_, **__: None):
+        renderer.render(view, handle, output="srgb8", **STATE)
+        work = counted_work(renderer, view, handle)
+    handle.release()
+    return work
 
 
-def main() -> None:
-    """Run, print, and write tests/benchmarks/results/gpu.json on hardware."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--quick", action="store_true", help="small frames, few")
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
+def forecast_rows(works: dict[tuple[str, str], FrameWork], results: dict) -> list[Row]:
+    """Return a row for each pass that ``results`` measured, by eye and view.
+
+    Parameters
+    ----------
+    works : dict
+        Work of all views of a frame by eye and setting, of at least two eyes.
+    results : dict
+        Content of gpu.json.
+    """
+    measured_ms = {
+        (row["case"], row["setting"], row["method"].strip()): row["median_ms"]
+        for row in results["rows"]
+    }
+    bounds_ms = {
+        (eye, f"{setting} frozen", stage): done.bound_ms(RATES["H200"])
+        for (eye, setting), work in works.items()
+        for stage, done in work.passes().items()
+        if stage not in STATE_STAGES
+    }
+    rows = []
+    for key, bound_ms in bounds_ms.items():
+        eye, setting, stage = key
+        others = [
+            other_ms / measured_ms[other]
+            for other, other_ms in bounds_ms.items()
+            if other[0] != eye and other[2] == stage and other in measured_ms
+        ]
+        if key not in measured_ms or not others:
+            continue
+        forecast_ms = bound_ms / float(np.mean(others))
+        error = forecast_ms / measured_ms[key] - 1.0
+        rows.append(
+            Row(
+                *("gpu", f"forecast {stage}", eye, setting, len(others)),
+                *(forecast_ms, forecast_ms, memory_mb(), "relative", error),
+                "gpu.json, NVIDIA H200",
+            )
+        )
+    return rows
+
+
+def options(parser: ArgumentParser) -> None:
+    """Add the choice of views, and the forecast."""
     parser.add_argument("--views", nargs="+", choices=VIEWS, default=list(VIEWS))
-    options = parser.parse_args()
+    parser.add_argument(
+        "--forecast", action="store_true", help="forecast passes from their work"
+    )
+
+
+def measure(run: Run) -> tuple[list[Row], dict[str, list[dict]]]:
+    """Return rows, and the clocks of the GPU after each case."""
     gpu = Gpu()
-    pace = QUICK_PACE if options.quick else PACE
+    names = run.options.views
+    if run.options.forecast:
+        works = {
+            (eye, name): counted_frame(gpu, eye, VIEWS[name][0]).times(VIEWS[name][1])
+            for name in (names[:1] if run.is_quick else names)
+            for eye in EYES
+        }
+        measured = json.loads((RESULTS / "gpu.json").read_text(encoding="utf-8"))
+        return forecast_rows(works, measured), {}
+    if gpu.is_software and not run.is_quick:
+        sys.exit("bench gpu: no hardware GPU; allowed: --quick, --forecast")
+    views = {name: VIEWS[name] for name in names}
+    if run.is_quick:
+        views = {QUICK_NAMES[name]: QUICK_VIEWS[QUICK_NAMES[name]] for name in names}
     rows: list[Row] = []
-    clocks = {}
+    clocks: list[dict] = []
     kept = KeptRows("gpu")
-    for setting, (size_px, view_count) in chosen_views(
-        options.views, is_quick=options.quick
-    ).items():
+    for setting, (size_px, view_count) in views.items():
         for eye in EYES:
             case = open_case(gpu, eye, setting, size_px, view_count)
-            for row in case_rows(gpu, case, pace):
+            for row in case_rows(gpu, case, QUICK_PACE if run.is_quick else PACE):
                 rows.append(row)
                 kept.add(row)
-            clocks[f"{setting} {eye}"] = nvidia_smi("clocks.sm,clocks.mem")
+            clocks.append(
+                {
+                    "gl_renderer": gpu.info["renderer"],
+                    "case": f"{setting} {eye}",
+                    "clocks": nvidia_smi("clocks.sm,clocks.mem"),
+                }
+            )
             case.release()
-    machine = {**machine_info(), "gl_renderer": gpu.info["renderer"], "clocks": clocks}
-    content = report(rows, machine=machine)
-    if options.json:
-        print(json.dumps(content))
-    else:
-        print_rows(rows)
-    is_whole = not options.quick and options.views == list(VIEWS)
-    if is_whole and not gpu.is_software:
-        write_report("gpu", content)
-
-
-if __name__ == "__main__":
-    main()
+    return rows, {"clocks": clocks}
