@@ -4,12 +4,10 @@ Networks here trace each row, see `traced_networks`: their answers are perfect, 
 by a known amount, whatever weights there are.
 """
 
-from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from PIL import Image
 
 from estimator.estimate.estimation import estimate_eye
 from estimator.eye.assembly import eye_surfaces
@@ -17,11 +15,9 @@ from estimator.eye.parameters import EyeParameters, mean_vector
 from estimator.networks.inference import WeightsMissing
 from estimator.profiles.parse import parse_profile
 from estimator.wavefront.aberrations import wavefront_grid
-from tests.benchmarks import bench_networks, network_nodes, network_steps
-from tests.benchmarks.bench_networks import print_all
-from tests.benchmarks.first_guess import guess_row
-from tests.benchmarks.network_plot import plot_steps
-from tests.benchmarks.published_networks import ERRORS, SECONDS, published_step
+from tests.benchmarks import bench_networks, network_nodes
+from tests.benchmarks.harness import Run
+from tests.benchmarks.paper_page.published import table
 from tests.numerical.traced_networks import (
     TracedNetwork,
     put_in_place,
@@ -106,13 +102,10 @@ def test_errors_of_wavefronts_are_the_networks_own(
 ):
     for offset_um in (0.0, OFF_UM):
         put_in_place(monkeypatch, aberration(offset_um=offset_um))
-        rows = network_steps.aberration_rows(
-            step, "myopia", vector, repeats=2, own_eye=vector
-        )
+        rows = bench_networks.aberration_rows(step, "myopia", vector, repeats=2)
         found = {row.method: row for row in rows}
         assert found["network"].n_nodes == found["exact"].n_nodes == 12
-        for method in ("network", network_steps.OWN_EYE):
-            assert found[method].error == pytest.approx(offset_um, abs=1e-6)
+        assert found["network"].error == pytest.approx(offset_um, abs=1e-6)
         assert found["exact"].error < 1e-6 < found["fewer rays"].error * 1e3
         assert found["exact"].error < found["fewer rays"].error < 1e-2
         assert found["exact"].target > 0.05
@@ -124,7 +117,7 @@ def test_errors_of_focus_are_the_networks_own(monkeypatch, few_nodes, vector):
         put_in_place(
             monkeypatch, TracedNetwork("focus", trace_focus, offset_um=offset_mm)
         )
-        rows = network_steps.focus_rows("myopia", vector, repeats=2, with_search=False)
+        rows = bench_networks.focus_rows("myopia", vector, repeats=2, with_search=False)
         for row in rows:
             found[row.method, row.error_name, offset_mm] = row.error
     assert found["network", "mean_abs_mm", 0.0] < 1e-6
@@ -144,83 +137,34 @@ def test_errors_of_focus_are_the_networks_own(monkeypatch, few_nodes, vector):
 
 def test_nodes_outside_of_the_training_are_counted(monkeypatch, few_nodes, vector):
     put_in_place(monkeypatch, aberration(ranges={"h_deg": (-30.0, 30.0)}))
-    some, *_ = network_steps.aberration_rows("off-axis", "myopia", vector, repeats=2)
+    some, *_ = bench_networks.aberration_rows("off-axis", "myopia", vector, repeats=2)
     assert (some.n_nodes, some.n_outside, some.error_name) == (6, 6, "mean_abs_um")
     assert "h_deg -45" in some.setting
     assert some.error < 1e-6
     put_in_place(monkeypatch, aberration(ranges={"eye_length_mm": (30.0, 31.0)}))
-    rows = network_steps.aberration_rows("off-axis", "myopia", vector, repeats=2)
-    none = rows[0]
+    none, *_ = bench_networks.aberration_rows("off-axis", "myopia", vector, repeats=2)
     assert (none.n_nodes, none.error_name, none.error) == (0, "n_outside", 12.0)
     assert none.median_ms == 0.0
     assert "eye_length_mm" in none.setting
 
 
-def row(step, method, case, *, ms, error, n_nodes=10, **more):
-    return network_steps.step_row(
-        *(step, case, method, ""),
-        times_ms=(ms, ms),
-        n=1,
-        error_name=more.pop("error_name", "mean_abs_um"),
-        error=error,
-        n_nodes=n_nodes,
-        n_outside=10 - n_nodes,
-        target=1.0,
-        reference="",
-    )
-
-
-ROWS = [
-    row("off-axis", "exact", "myopia", ms=400.0, error=1e-9),
-    row("off-axis", "network", "myopia", ms=10.0, error=0.01),
-    row("off-axis", "exact", "cataract", ms=600.0, error=1e-9),
-    row("off-axis", "network", "cataract", ms=10.0, error=0.03, n_nodes=5),
-    row("off-axis", "exact", "keratoconus", ms=700.0, error=1e-9),
-    row("off-axis", "network", "keratoconus", ms=0.0, error=10, n_nodes=0),
-]
-ROWS[-1] = replace(ROWS[-1], error_name=network_steps.N_OUTSIDE)
-
-
-def test_published_figures_stand_beside_their_methods():
-    # tables 4 and 5 of the paper
-    theirs = published_step("eye", "keratoconus", "search")
-    assert (theirs.median_ms, theirs.error, theirs.target) == (10642e3, 0.0076, 0.2894)
-    theirs = published_step("off-axis", "cataract", "network")
-    assert (theirs.median_ms, theirs.error, theirs.target) == (583.0, 0.0208, 0.4156)
-    assert "Ryzen 7 1700" in theirs.hardware
-    assert published_step("eye", "myopia", "network + refined") is None
-    assert {len(rows) for rows in (*SECONDS.values(), *ERRORS.values())} == {6}
-
-
 def test_our_conditions_are_theirs_by_their_mean_target():
     for case in ("emmetropia", "myopia", "astigmatism", "post_lasik"):
-        theirs = published_step("eye", case, "network").target
+        theirs = table(5)["eye"]["target"][case]
         zernike_um = parse_profile({"kind": "preset", "name": case}).zernike_um
         assert np.abs(zernike_um[1:]).mean() == pytest.approx(theirs, abs=1e-3), case
 
 
 def test_a_refinement_that_ends_badly_or_not_at_all_has_failed():
-    common = {"time_ms": 8.0, "n_iterations": 3, "n_evaluations": 99}
     eyes = [
-        SimpleNamespace(
-            mean_abs_error_um=error_um, start=start, network_reason="", **common
-        )
-        for error_um, start in ((1e-5, "network"), (2e-5, "table"), (0.02, "table"))
+        SimpleNamespace(mean_abs_error_um=error_um, time_ms=8.0)
+        for error_um in (1e-5, 2e-5, 0.02)
     ]
-    found = guess_row(("table", "network"), [*eyes, None])
-    assert (found.n, found.n_failed, found.n_from_network) == (4, 2, 1)
-    assert (found.error, found.median_iterations) == (2e-5, 3.0)
-    assert found.setting == "from table or network"
-
-
-def test_tables_and_plot_show_every_method(capsys, tmp_path):
-    print_all(ROWS)
-    text = capsys.readouterr().out
-    assert "Ryzen 7 1700" in text
-    assert "n_outside" in text
-    plot_steps(ROWS, tmp_path / "networks.png")
-    with Image.open(tmp_path / "networks.png") as picture:
-        assert picture.size[0] > 300
+    rows = bench_networks.refined_rows("all", ("table", "network"), [*eyes, None])
+    assert {row.n for row in rows} == {4}
+    assert {row.setting for row in rows} == {"from table or network"}
+    errors = {row.error_name: row.error for row in rows}
+    assert (errors["median_um"], errors["failed"]) == (2e-5, 2)
 
 
 def test_without_weights_the_bench_says_what_to_do(monkeypatch):
@@ -228,6 +172,5 @@ def test_without_weights_the_bench_says_what_to_do(monkeypatch):
         raise WeightsMissing(f"weights of {name} are missing")
 
     monkeypatch.setattr(bench_networks, "load_network", missing)
-    monkeypatch.setattr("sys.argv", ["bench_networks", "--quick"])
     with pytest.raises(SystemExit, match="weights of eye are missing"):
-        bench_networks.main()
+        bench_networks.measure(Run(is_quick=True))
