@@ -10,13 +10,13 @@ from html.parser import HTMLParser
 
 import pytest
 
+from tests.benchmarks.paper_page.content import all_sections
 from tests.benchmarks.paper_page.measured import Measured, ResultMissing
-from tests.benchmarks.paper_page.numbers import value_text
 from tests.benchmarks.paper_page.page import (
     FRESH_NOTE,
-    all_sections,
     page,
     summary_line,
+    value_text,
 )
 from tests.benchmarks.paper_page.published import FIGURES, TABLES, table
 from tests.benchmarks.paper_page.rows import (

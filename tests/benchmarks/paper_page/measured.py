@@ -55,14 +55,25 @@ class Measured:
         return self.fresh is not None and (self.fresh / f"{name}.json").is_file()
 
     def rows(self, name: str, **wanted) -> list[dict]:
-        """Rows of a file whose fields are as wanted."""
+        """Rows of a file whose fields are as wanted.
+
+        A wanted "start*" is any text that starts so, and a tuple is any of its values.
+        """
+
+        def fits(value, one) -> bool:
+            if isinstance(one, tuple):
+                return value in one
+            if isinstance(one, str) and one.endswith("*"):
+                return value.startswith(one[:-1])
+            return value == one
+
         return [
             row
             for row in self.results(name)["rows"]
-            if all(row.get(key) == value for key, value in wanted.items())
+            if all(fits(row.get(key), one) for key, one in wanted.items())
         ]
 
-    def value(self, name: str, column: str, **wanted) -> float | None:
+    def value(self, name: str, column: str, **wanted):
         """One field of the first such row; None where there is none, or it is NaN."""
         for row in self.rows(name, **wanted):
             if row[column] is not None and row[column] == row[column]:
@@ -88,6 +99,7 @@ class Measured:
             parts.append("machine not told")
             return ", ".join(parts)
         parts.append(f"{machine['cpu']}, {machine['n_cores']} cores")
+        machine = machine | next(iter(content.get("clocks", [])), {})
         renderer = machine.get("renderer") or machine.get("gl_renderer")
         if renderer:
             parts.append(renderer)

@@ -1,19 +1,17 @@
 """The page itself: sections as one HTML file that needs nothing else."""
 
 import base64
+import math
 from collections import Counter
 from collections.abc import Sequence
 from html import escape
 from pathlib import Path
+from statistics import median
 
 from tests.benchmarks.harness import commit_id
-from tests.benchmarks.paper_page.estimating import sections as estimating_sections
-from tests.benchmarks.paper_page.figures import first_figure, picture_sections
+from tests.benchmarks.paper_page.content import all_sections
 from tests.benchmarks.paper_page.measured import Measured
-from tests.benchmarks.paper_page.numbers import median_text, range_text, value_text
-from tests.benchmarks.paper_page.published import published
-from tests.benchmarks.paper_page.rendering import pipeline_section, psf_section
-from tests.benchmarks.paper_page.rendering import sections as rendering_sections
+from tests.benchmarks.paper_page.published import published, words
 from tests.benchmarks.paper_page.rows import (
     APART,
     VERDICTS,
@@ -28,6 +26,8 @@ from tests.benchmarks.paper_page.rows import (
 STYLE = Path(__file__).parent / "page.css"
 TITLE = "ocufilter beside the paper"
 EMPTY = "–"
+SECONDS_OF = {"ms": 1e-3, "s": 1.0, "h": 3600.0}
+SMALLEST_PLAIN = 1e-4
 
 FRESH_NOTE = (
     "Some figures are of a run just made (see the last section); the words beside the "
@@ -37,38 +37,53 @@ FRESH_NOTE = (
 FEW_LINES = 3
 """Blocks of so few lines are shown as they are, without medians."""
 
-READING = (
-    "<b>Published</b>: as the paper prints it, on its hardware.",
-    "<b>ocufilter</b>: ours for the same task, in the conditions nearest to theirs.",
-    "<b>Rebuilt</b>: the same system built anew by this project, on our machine; "
-    "beside it <b>ocufilter there</b>, in the very same conditions, which is fairest.",
-    "<b>Better, worse</b>: of the two numbers as they stand.  Level: within 2 %, of "
-    "PSNRs within 0.5 dB.  Not comparable: one is missing, or a line says why.",
-    "A published figure that stands beside two ways of ocufilter, as its exact method "
-    "and its networks in Tables 4 and 5, counts twice; parts of pictures (Figures 9 to "
-    "12) do not count in the summary.",
-    "Pupils, foci and eyes are the paper's six conditions, whose wavefronts are the "
-    "same to four digits; the eyes' periphery follows from the eye model, as there.",
-)
+
+Value = float | str | None
 
 
-def all_sections(measured: Measured) -> list[Section]:
-    """Return every figure and table, by number."""
-    found = [
-        first_figure(measured),
-        *estimating_sections(measured),
-        *rendering_sections(measured),
-        *picture_sections(measured),
-        psf_section(measured),
-        pipeline_section(measured),
-    ]
-    order = {"Figure": 0, "Table": 1, "Section": 2}
+def value_text(value: Value, unit: str) -> str:
+    """Print one value with three digits; a time in whatever unit suits it."""
+    if value is None:
+        return EMPTY
+    if isinstance(value, str):
+        return value
+    if unit in SECONDS_OF:
+        seconds = value * SECONDS_OF[unit]
+        if seconds >= 3600.0:
+            return f"{number_text(seconds / 3600.0)} h"
+        if seconds >= 1.0:
+            return f"{number_text(seconds)} s"
+        return f"{number_text(1e3 * seconds)} ms"
+    if unit == "dB":
+        return f"{value:.1f} dB"
+    if unit in ("layers", "PSFs"):
+        return f"{value:,.0f}"
+    return f"{number_text(value)} {unit}"
 
-    def place(section: Section) -> tuple:
-        kind, _, number = section.number.partition(" ")
-        return order[kind] if number != "1" else -1, float(number)
 
-    return sorted(found, key=place)
+def number_text(value: float) -> str:
+    """Print three significant digits, the smallest ones as powers of ten."""
+    if value == 0.0:
+        return "0"
+    exponent = math.floor(math.log10(abs(value)))
+    if abs(value) < SMALLEST_PLAIN:
+        return f"{value / 10.0**exponent:.1f}·10<sup>{exponent}</sup>"
+    return f"{value:,.{max(0, 2 - exponent)}f}"
+
+
+def _numbers(values: Sequence[Value]) -> list[float]:
+    return [v for v in values if v is not None and not isinstance(v, str)]
+
+
+def _median_text(values: Sequence[Value], unit: str) -> str:
+    numbers = _numbers(values)
+    return value_text(median(numbers), unit) if numbers else EMPTY
+
+
+def _range_text(values: Sequence[Value], unit: str) -> str:
+    numbers = _numbers(values)
+    low, high = (value_text(v, unit) for v in (min(numbers), max(numbers)))
+    return low if low == high else f"{low} to {high}"
 
 
 def page(measured: Measured) -> str:
@@ -180,42 +195,39 @@ def _class(verdict: str) -> str:
 
 def _worse(sections: Sequence[Section]) -> str:
     """Say plainly where the paper, or its method built anew, is better."""
-    lines = []
+    items = []
     for section in sections:
         for block in section.blocks:
             if not (block.is_own and block.is_contest):
                 continue
+            unit = block.measure.unit
+            scene = f", {escape(block.scene)}" if block.scene else ""
             beside = [n for n in block.lines if block.verdict(n) == WORSE]
             there = [n for n in block.lines if block.verdict_there(n) == WORSE]
-            if beside:
-                theirs = [n.published for n in beside]
-                ours = [n.ours for n in beside]
-                lines.append(_worse_line(section, block, beside, theirs, ours, ""))
-            if there:
-                theirs = [n.rebuilt for n in there]
-                ours = [n.ours_there for n in there]
-                how = f" (rebuilt: {block.rebuilt_as})"
-                lines.append(_worse_line(section, block, there, theirs, ours, how))
+            for pairs, how in (
+                ([(n.published, n.ours) for n in beside], ""),
+                (
+                    [(n.rebuilt, n.ours_there) for n in there],
+                    f" (rebuilt: {block.rebuilt_as})",
+                ),
+            ):
+                if not pairs:
+                    continue
+                theirs, ours = (_range_text(v, unit) for v in zip(*pairs, strict=True))
+                items.append(
+                    f"<li><a href='#{section.anchor}'>{section.number}</a>{scene}: "
+                    f"{block.measure.name}{escape(how)}, {len(pairs)} of "
+                    f"{len(block.lines)} rows: the paper {theirs}, "
+                    f"ocufilter {ours}</li>"
+                )
     return (
         "<section><h2>Where the paper is better</h2><p>Its own method only, row by "
-        "row; the sections say what differs.</p><ul>"
-        + "".join(lines)
-        + "</ul></section>"
-    )
-
-
-def _worse_line(section, block: Block, lines, theirs, ours, how: str) -> str:
-    unit = block.measure.unit
-    scene = f", {escape(block.scene)}" if block.scene else ""
-    return (
-        f"<li><a href='#{section.anchor}'>{section.number}</a>{scene}: "
-        f"{block.measure.name}{escape(how)}, {len(lines)} of {len(block.lines)} rows: "
-        f"the paper {range_text(theirs, unit)}, ocufilter {range_text(ours, unit)}</li>"
+        f"row; the sections say what differs.</p><ul>{''.join(items)}</ul></section>"
     )
 
 
 def _reading() -> str:
-    items = "".join(f"<li>{text}</li>" for text in READING)
+    items = "".join(f"<li>{text}</li>" for text in words()["page"]["reading"])
     return f"<section><h2>How to read it</h2><ul>{items}</ul></section>"
 
 
@@ -276,73 +288,56 @@ def _heads(section: Section) -> tuple[bool, bool, bool]:
     )
 
 
-def _head_row(first: Sequence[str], section: Section) -> str:
-    has_published, has_rebuilt, has_there = _heads(section)
-    names = list(first)
-    if has_published:
-        names += ["published", "ocufilter", ""]
-    if has_rebuilt:
-        names.append("rebuilt")
-    if has_there:
-        names += ["ocufilter there", ""]
-    return "<tr>" + "".join(f"<th scope=col>{name}</th>" for name in names) + "</tr>"
+def _row(heads: tuple[bool, bool, bool], cells: Sequence[str], tag: str = "td") -> str:
+    """Join the cells of published and ours with verdict, rebuilt, ours and verdict."""
+    has_published, has_rebuilt, has_there = heads
+    shown = (has_published,) * 3 + (has_rebuilt,) + (has_there,) * 2
+    return "".join(
+        cell if cell.startswith("<") else f"<{tag}>{cell}</{tag.split()[0]}>"
+        for cell, is_shown in zip(cells, shown, strict=True)
+        if is_shown
+    )
+
+
+def _table(section: Section, rows: Sequence[str], *, caption: str | None) -> str:
+    names = ("published", "ocufilter", "", "rebuilt", "ocufilter there", "")
+    head = f"<tr><th scope=col></th>{_row(_heads(section), names, 'th scope=col')}</tr>"
+    said = "" if caption is None else f"<caption>{caption}</caption>"
+    return (
+        f"<table class=lines>{said}<thead>{head}</thead>"
+        f"<tbody>{''.join(rows)}</tbody></table>"
+    )
 
 
 def _by_system(section: Section, *, title: str) -> str:
     """One row a block: medians, and how often ocufilter is better."""
-    has_published, has_rebuilt, has_there = _heads(section)
     rows = []
     for block in section.blocks:
-        unit = block.measure.unit
-        cells = [f"<th scope=row>{_name(block)}</th>"]
-        if has_published:
-            cells += [
-                f"<td>{median_text([n.published for n in block.lines], unit)}</td>",
-                f"<td>{median_text([n.ours for n in block.lines], unit)}</td>",
-                f"<td class=verdicts>{_block_tally(block)}</td>",
-            ]
-        if has_rebuilt:
-            cells.append(
-                f"<td>{median_text([n.rebuilt for n in block.lines], unit)}</td>"
-            )
-        if has_there:
-            cells += [
-                f"<td>{median_text(_ours_there(block), unit)}</td>",
-                f"<td class=verdicts>{_block_tally_there(block)}</td>",
-            ]
-        rows.append(f"<tr{_own(block)}>{''.join(cells)}</tr>")
-    return (
-        f"<table class=lines><caption>{title}</caption><thead>"
-        f"{_head_row([''], section)}</thead><tbody>{''.join(rows)}</tbody></table>"
-    )
-
-
-def _block_tally(block: Block) -> str:
-    if not block.is_contest:
-        return EMPTY
-    return _tally(
-        Counter(block.verdict(n) for n in block.lines if n.published is not None)
-    )
-
-
-def _block_tally_there(block: Block) -> str:
-    if not (block.is_contest and block.rebuilt_is_same):
-        return EMPTY
-    return _tally(
-        Counter(
-            block.verdict_there(n)
-            for n in block.lines
-            if n.rebuilt is not None and n.ours_there is not None
+        unit, lines = block.measure.unit, block.lines
+        there = [n for n in lines if n.rebuilt is not None]
+        beside = Counter(block.verdict(n) for n in lines if n.published is not None)
+        beside_there = Counter(
+            block.verdict_there(n) for n in there if n.ours_there is not None
         )
-    )
+        is_same = block.is_contest and block.rebuilt_is_same
+        cells = _row(
+            _heads(section),
+            (
+                _median_text([n.published for n in lines], unit),
+                _median_text([n.ours for n in lines], unit),
+                _tally_cell(beside if block.is_contest else Counter()),
+                _median_text([n.rebuilt for n in lines], unit),
+                _median_text([n.ours_there for n in there], unit),
+                _tally_cell(beside_there if is_same else Counter()),
+            ),
+        )
+        own = " class=own" if block.is_own else ""
+        rows.append(f"<tr{own}><th scope=row>{_name(block)}</th>{cells}</tr>")
+    return _table(section, rows, caption=title)
 
 
-def _ours_there(block: Block) -> list[float | None]:
-    return [n.ours_there for n in block.lines if n.rebuilt is not None]
-
-
-def _own(block: Block) -> str:
-    return " class=own" if block.is_own else ""
+def _tally_cell(found: Counter) -> str:
+    return f"<td class=verdicts>{_tally(found)}</td>"
 
 
 def _name(block: Block) -> str:
@@ -366,36 +361,25 @@ def _all_lines(section: Section) -> str:
             title += f" · <i>not comparable: {escape(block.incomparable)}</i>"
         rows.append(f"<tr class=block><th colspan={width}>{title}</th></tr>")
         rows += [_line(block, line, heads) for line in block.lines]
-    return (
-        f"<table class=lines><thead>{_head_row([''], section)}</thead>"
-        f"<tbody>{''.join(rows)}</tbody></table>"
-    )
+    return _table(section, rows, caption=None)
 
 
 def _line(block: Block, line: Line, heads: tuple[bool, bool, bool]) -> str:
-    has_published, has_rebuilt, has_there = heads
     unit = block.measure.unit
-    cells = [f"<th scope=row>{escape(line.case)}</th>"]
-    if has_published:
-        cells += [
-            f"<td>{value_text(line.published, unit)}</td>",
-            f"<td>{value_text(line.ours, unit)}</td>",
+    is_there = block.is_contest and block.rebuilt_is_same
+    is_there = is_there and None not in (line.rebuilt, line.ours_there)
+    cells = _row(
+        heads,
+        (
+            value_text(line.published, unit),
+            value_text(line.ours, unit),
             _verdict_cell(block.verdict(line), shown=block.is_contest),
-        ]
-    shown = (
-        block.is_contest
-        and block.rebuilt_is_same
-        and line.rebuilt is not None
-        and line.ours_there is not None
+            value_text(line.rebuilt, unit),
+            value_text(line.ours_there if is_there else None, unit),
+            _verdict_cell(block.verdict_there(line), shown=is_there),
+        ),
     )
-    if has_rebuilt:
-        cells.append(f"<td>{value_text(line.rebuilt, unit)}</td>")
-    if has_there:
-        cells += [
-            f"<td>{value_text(line.ours_there if shown else None, unit)}</td>",
-            _verdict_cell(block.verdict_there(line), shown=shown),
-        ]
-    return f"<tr>{''.join(cells)}</tr>"
+    return f"<tr><th scope=row>{escape(line.case)}</th>{cells}</tr>"
 
 
 def _verdict_cell(verdict: str, *, shown: bool) -> str:

@@ -3,31 +3,79 @@
     ocufilter paper [-o paper.html] [--fresh [--quick]] [--json]
 
 Without options from the committed results, in seconds.  With --fresh the benchmarks run
-first and the page says so; --quick takes few cases of each, at small sizes.
+first and the page says so; --quick takes few cases of each, at small sizes.  Results of
+a fresh run go to a folder of their own.  What needs another machine, an hour
+(live.json), or the training, stays as committed.
 """
 
 import argparse
 import json
+import subprocess
 import sys
 from pathlib import Path
 
 from filter_service.progress import Progress
-from tests.benchmarks.harness import OUT
-from tests.benchmarks.paper_page.fresh import (
-    BenchFailed,
-    announcement,
-    run_all,
-)
+from tests.benchmarks.harness import OUT, ROOT
+from tests.benchmarks.paper_page.content import all_sections
 from tests.benchmarks.paper_page.measured import Measured, ResultMissing
-from tests.benchmarks.paper_page.page import (
-    all_sections,
-    page,
-    summary_line,
-    without_pictures,
-)
+from tests.benchmarks.paper_page.page import page, summary_line, without_pictures
 from tests.benchmarks.paper_page.rows import VERDICTS, counts, counts_there
 
 FRESH = OUT / "paper"
+TAIL_CHARACTERS = 300
+PICTURES = "tests.benchmarks.paper_page.pictures"
+RUNS = {
+    # benchmark: module and arguments, minutes of a whole and of a quick run
+    "paper_layouts": (("tests.benchmarks", "paper_layouts", "--json"), 0.2, 0.2),
+    "layers": (("tests.benchmarks", "layers", "--json"), 4.0, 1.0),
+    "networks": (("tests.benchmarks", "networks", "--json"), 6.0, 0.5),
+    "published": (("tests.benchmarks", "published", "--json"), 8.0, 2.0),
+    "paper_figures": ((PICTURES, "--out", str(FRESH)), 12.0, 1.0),
+    "field": (("tests.benchmarks", "field", "--json"), 90.0, 1.5),
+}
+
+
+class BenchFailed(Exception):
+    """A benchmark ended with an error."""
+
+
+def announcement(*, quick: bool) -> str:
+    """Say what will run, and about how long."""
+    minutes = {name: run[2 if quick else 1] for name, run in RUNS.items()}
+    return (
+        f"Running {len(RUNS)} benchmarks, about {sum(minutes.values()):.0f} minutes of "
+        f"two quiet cores: {', '.join(f'{n} {m:g} min' for n, m in minutes.items())}.  "
+        "gpu.json, live.json, table3.json and table11.json stay as committed."
+    )
+
+
+def run_all(*, quick: bool, progress: Progress) -> None:
+    """Run every benchmark; results lie in `FRESH` then.
+
+    Raises
+    ------
+    BenchFailed
+    """
+    FRESH.mkdir(parents=True, exist_ok=True)
+    for old in FRESH.glob("*.json"):
+        old.unlink()
+    task = progress.task("Benchmarks", total=len(RUNS), unit="done")
+    for done, (name, (command, *_)) in enumerate(RUNS.items()):
+        task.update(done, name)
+        finished = subprocess.run(
+            [sys.executable, "-m", *command, *(["--quick"] if quick else [])],
+            cwd=ROOT,
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        if finished.returncode != 0:
+            why = finished.stderr.strip()[-TAIL_CHARACTERS:]
+            raise BenchFailed(f"{name} ended with code {finished.returncode}: {why}")
+        if "--json" in command:
+            path = FRESH / f"{name}.json"
+            path.write_text(finished.stdout, encoding="utf-8")
+    task.update(len(RUNS))
 
 
 def _arguments() -> argparse.Namespace:
@@ -56,7 +104,7 @@ def main() -> int:
         if arguments.fresh:
             print(announcement(quick=arguments.quick), file=sys.stderr)
             with Progress() as progress:
-                run_all(FRESH, quick=arguments.quick, progress=progress)
+                run_all(quick=arguments.quick, progress=progress)
             measured = Measured(fresh=FRESH)
         text = page(measured)
         arguments.out.write_text(text, encoding="utf-8")

@@ -1,27 +1,23 @@
 """Table 6 anew: the PSF textures of the paper and of its predecessor, rebuilt.
 
-    python -m tests.benchmarks.paper_page.layouts [--quick] [--json]
-
 33 distances on the axis, a pupil of 5 mm that looks at 0.5 dpt, 1280x720 over 50
 degrees: how many layers each layout takes and how much memory, for every eye.  The
 time is that of making the paper's layers from its PSFs and of computing those, on the
-processor.  A whole run takes seconds and writes results/paper_layouts.json.
+processor.
 
 Error: none is made here.  That of pictures through these textures stands in
 `bench_field`; the row holds the largest radius in px, which decides the memory.
 """
 
-import argparse
-import sys
-
 from tests.benchmarks.field_methods import EyeBench, State
-from tests.benchmarks.harness import Row, publish
+from tests.benchmarks.harness import Row, Run
 from tests.benchmarks.paper_layout import BYTES_PER_TEXEL, ON_AXIS, kept_texture
 from tests.benchmarks.published_figures import CONDITIONS
 from tests.benchmarks.resized_psfs import full_radius_px
 from tests.benchmarks.view_sources import EyeState
 from tests.numerical.scene_frames import scene_view
 
+MINUTES = 0.2
 STATE = State(5.0, 0.5)
 
 
@@ -49,21 +45,11 @@ def _row(method: str, eye: str, layer_count: int, radius_px: int, time_ms) -> Ro
     )
 
 
-def main() -> int:
-    """Run the program; its exit code."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--quick", action="store_true", help="one eye")
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
-    arguments = parser.parse_args()
+def measure(run: Run) -> list[Row]:
+    """Return two rows for each eye, or for one."""
     view = scene_view("courtyard", width_px=1280, height_px=720)
     rows = []
-    for eye in CONDITIONS[:1] if arguments.quick else CONDITIONS:
+    for eye in CONDITIONS[:1] if run.is_quick else CONDITIONS:
         state = EyeBench(None, eye, [view]).exact_state(STATE, on_axis=True)
         rows += [predecessor_row(eye, state), paper_row(eye, state)]
-    is_whole = not arguments.quick
-    publish("paper_layouts", rows, as_json=arguments.json, is_whole=is_whole)
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+    return rows
