@@ -81,7 +81,7 @@ witness: setup-witness  ## compare frames with a path tracer that renders throug
 	$(PYTHON) -m tests.benchmarks witness $(ARGS)
 
 peers: setup-peers  ## compare with alternatives such as optiland and DeepLens (6 GB)
-	$(PYTHON) -m tests.benchmarks.bench_peers $(ARGS)
+	$(PYTHON) -m tests.benchmarks peers $(ARGS)
 
 gpu-kit: setup  ## build a kit for a GPU machine without a network; writes out/gpu_kit/
 	@PYTHON=$(PYTHON) PYTHON_VERSION="$(PYTHON_VERSION)" WITH="$(WITH)" \

@@ -1,7 +1,5 @@
 """The lens that is best for a scene, and the best correction of the eye alone.
 
-    python -m tests.benchmarks.bench_best_lens [--quick] [--json]
-
 Eyes of -2 dpt, with astigmatism, with keratoconus, after LASIK, and of 60 years look
 through 3 and 5 mm at letters and a photograph of scikit-image, far away, and at a
 courtyard with depth, relaxed; the last one also at letters and photographs both far
@@ -9,10 +7,9 @@ away and at 0.4 m, through single-vision and progressive lenses.  The lens of th
 is compared with the one of the highest visual Strehl ratio: error by the measure of the
 search, retinal PSNR, visual Strehl ratio and acuity for far objects.  A grid of 26
 lenses 0.1 dpt around the result (power vector at the pupil) shows whether it is a
-minimum.  Writes results/best_lens.json.
+minimum.
 """
 
-import argparse
 from contextlib import ExitStack
 from dataclasses import replace
 from itertools import product
@@ -43,7 +40,7 @@ from tests.benchmarks.bench_correct import (
     SMALL_FOV_DEG,
     prescription,
 )
-from tests.benchmarks.harness import KeptRows, Row, memory_mb, publish
+from tests.benchmarks.harness import Row, Run, memory_mb
 from tests.source_tree import ROOT
 
 EYES = {
@@ -53,6 +50,7 @@ EYES = {
     "post-LASIK": {"kind": "preset", "name": "post_lasik"},
     "60 years": prescription(0.0, age_years=60),
 }
+MINUTES = 10
 PUPILS_MM = 3.0, 5.0
 COURTYARD_FOV_DEG, COURTYARD_MM, SKY_MM = 50.0, 1000.0, 65535
 NEAR_M, READING_DEG = 0.4, (0.0, -30.0)
@@ -210,28 +208,13 @@ def compared(builder, name, pupil_mm, setting, scenes, lens, settings):
         yield row, details
 
 
-def main() -> None:
-    """Run from the command line."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--quick", action="store_true", help="one eye, one pupil")
-    parser.add_argument("--json", action="store_true", help="print the report alone")
-    options = parser.parse_args()
-    kept, rows, details = KeptRows("best_lens"), [], []
+def measure(run: Run) -> tuple[list[Row], dict[str, list[dict]]]:
+    """Return rows, and the lenses that were found."""
     with ExitStack() as closing:
         builder = open_inline_builder(closing, engine="native")
-        for case in cases(is_quick=options.quick):
-            for row, found in compared(builder, *case):
-                kept.add(row)
-                rows.append(row)
-                details.append(found)
-    publish(
-        "best_lens",
-        rows,
-        as_json=options.json,
-        is_whole=not options.quick,
-        details={"lenses": details},
-    )
-
-
-if __name__ == "__main__":
-    main()
+        found = [
+            pair
+            for case in cases(is_quick=run.is_quick)
+            for pair in compared(builder, *case)
+        ]
+    return [row for row, _ in found], {"lenses": [details for _, details in found]}

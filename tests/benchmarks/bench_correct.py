@@ -1,7 +1,5 @@
 """Pictures solved for viewers: time, retinal error, acuity, and Wiener filters.
 
-    python -m tests.benchmarks.bench_correct [--quick] [--json]
-
 Viewers of -1 and -2 dpt, with astigmatism and with keratoconus look at letters and at a
 photograph of scikit-image, far away, through 3 and 4 mm.  Solved: for their state, and
 for ranges of 0.5 mm and 0.25 dpt, judged by the mean over them and at one corner, 0.5
@@ -10,11 +8,9 @@ regularization that is best in each case, are clipped, and have the same target.
 viewer of -1 dpt also looks at pictures solved for what another eye sees.  Acuity
 is that of the transfer from the chart to the retina, up to the frequency of the pixels.
 Frames of 480x270 show the time until the error is within 0.01 of the least one, of
-1,000 iterations, relative to that of the target displayed as it is.  Writes
-results/correct.json.
+1,000 iterations, relative to that of the target displayed as it is.
 """
 
-import argparse
 import time
 from contextlib import ExitStack
 from functools import partial
@@ -31,8 +27,10 @@ from filter_service.correcting.correction import compressed, psnr_db
 from filter_service.filtering.eye_filter import EyeFilter
 from filter_service.filtering.shared_builder import open_inline_builder
 from filter_service.rgbd_view import RgbdView
-from tests.benchmarks.harness import KeptRows, Row, memory_mb, publish
+from tests.benchmarks.harness import Row, Run, memory_mb
 from tests.benchmarks.wiener_pictures import by_one_psf, by_tiles, log_mar_of_picture
+
+MINUTES = 20
 
 
 def prescription(sphere_dpt: float, **more) -> dict:
@@ -294,12 +292,8 @@ def speed_rows(builder, cases, long_iterations):
             yield row, details
 
 
-def main() -> None:
-    """Run from the command line."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--quick", action="store_true", help="few cases")
-    parser.add_argument("--json", action="store_true", help="print the report alone")
-    options = parser.parse_args()
+def measure(run: Run) -> tuple[list[Row], dict[str, list[dict]]]:
+    """Return rows, all measures of the compared pictures, and processor times."""
     cases = [
         *product((SMALL_FOV_DEG,), VIEWERS, PUPILS_MM, PICTURES, CONTRASTS),
         *product((WIDE_FOV_DEG,), ("-2 dpt", "keratoconus"), (4.0,), PICTURES, (0.5,)),
@@ -309,32 +303,16 @@ def main() -> None:
         *(("keratoconus", "letters", 1.0), ("keratoconus", "photograph", 0.5)),
     ]
     n_iterations = LONG_ITERATIONS
-    if options.quick:
+    if run.is_quick:
         cases, speed_cases = cases[:1], speed_cases[:1]
         n_iterations = QUICK_ITERATIONS
-    kept, rows, details, speeds = KeptRows("correct"), [], [], []
     with ExitStack() as closing:
         builder = open_inline_builder(closing, engine="native")
-        if not options.quick:
-            for row in shown_rows(builder):
-                kept.add(row)
-                rows.append(row)
-        for row, found in comparison_rows(builder, cases):
-            kept.add(row)
-            rows.append(row)
-            details.append(found)
-        for row, found in speed_rows(builder, speed_cases, n_iterations):
-            kept.add(row)
-            rows.append(row)
-            speeds.append(found)
-    publish(
-        "correct",
-        rows,
-        as_json=options.json,
-        is_whole=not options.quick,
-        details={"comparison": details, "speed": speeds},
-    )
-
-
-if __name__ == "__main__":
-    main()
+        rows = [] if run.is_quick else list(shown_rows(builder))
+        comparison = list(comparison_rows(builder, cases))
+        speed = list(speed_rows(builder, speed_cases, n_iterations))
+    rows += [row for row, _ in comparison + speed]
+    return rows, {
+        "comparison": [found for _, found in comparison],
+        "speed": [found for _, found in speed],
+    }

@@ -1,7 +1,5 @@
 """Derivatives of images by parameters of an eye: time beside error.
 
-    python -m tests.benchmarks.bench_gradients [--quick] [--json]
-
 Smooth blobs of light, 48x32 px of 0.65 mrad, at one wavelength, through six eyes.
 
 - smooth: one distance.  The reference is the derivative of images by float64 quadrature
@@ -16,11 +14,9 @@ Smooth blobs of light, 48x32 px of 0.65 mrad, at one wavelength, through six eye
 
 "amplitude" is the error of the projection of a derivative image on the reference, "RMS"
 that of pixels relative to the RMS of the reference.  Eyes accommodate for derivatives
-by pupil and focus, and are relaxed for those by numbers of the profile.  Writes
-results/gradients.json.
+by pupil and focus, and are relaxed for those by numbers of the profile.
 """
 
-import argparse
 import time
 from collections.abc import Iterator
 from dataclasses import replace
@@ -37,13 +33,14 @@ from filter_service import (
     image_derivatives,
 )
 from filter_service.filtering.derivatives import ACCURACIES, PROFILE_STEPS, STEPS
-from tests.benchmarks.harness import KeptRows, Row, memory_mb, publish
+from tests.benchmarks.harness import Row, Run, memory_mb
 from tests.reference.flat_image import (
     FlatScene,
     derivative,
     wavefront_of_profile,
 )
 
+MINUTES = 3
 WIDTH, HEIGHT = 48, 32
 CAMERA = Camera.from_fov(1.2, width_px=WIDTH, height_px=HEIGHT)
 SETTINGS = FilterSettings(mode="on-axis", eye_model="wavefront", chromatic=False)
@@ -253,20 +250,7 @@ def _rows(name, setting, profile, view, parameter, state, truths) -> Iterator[Ro
                 )
 
 
-def main() -> None:
-    """Run from the command line."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--quick", action="store_true", help="one eye")
-    parser.add_argument("--json", action="store_true", help="print the report alone")
-    options = parser.parse_args()
-    eyes = list(STATES)[: 1 if options.quick else None]
-    rows, kept = [], KeptRows("gradients")
-    for name in eyes:
-        for row in rows_of(name):
-            rows.append(row)
-            kept.add(row)
-    publish("gradients", rows, as_json=options.json, is_whole=not options.quick)
-
-
-if __name__ == "__main__":
-    main()
+def measure(run: Run) -> list[Row]:
+    """Return the rows of all eyes, or of one."""
+    eyes = list(STATES)[: 1 if run.is_quick else None]
+    return [row for name in eyes for row in rows_of(name)]

@@ -1,7 +1,5 @@
 """One eye per image, as for training networks: processor time beside error.
 
-    python -m tests.benchmarks.bench_ml [--quick] [--json]
-
 An image of 256x256 px and 20 deg at 2 m, through another drawn person, with another
 pupil and focus, for each image; one thread.  Times are those of all processes, for an
 image: the filter alone, without reading or writing files.
@@ -28,12 +26,11 @@ one blur for all pixels and colors, of no eye.
 
 Last, four processes filter as the workers of a data loader do, with the defaults of
 threads and builders: see `loader_workers`.  "none" returns the picture as it is, and is
-what the workers take without a filter.  Writes results/ml.json.
+what the workers take without a filter.
 """
 
 from filter_service import one_blas_thread  # noqa: F401, I001  (before any numpy)
 
-import argparse
 import importlib.util
 import itertools
 import json
@@ -52,10 +49,11 @@ from PIL import Image
 
 from estimator.threads import THREADS_VARIABLE
 from filter_service import Camera, EyeBank, EyeFilter, FilterSettings
-from tests.benchmarks.harness import Row, memory_mb, publish, time_calls
+from tests.benchmarks.harness import Row, Run, memory_mb, time_calls
 from tests.benchmarks.loader_workers import SeenPictures, digest, measured
 from tests.numerical.scene_frames import scene_view
 
+MINUTES = 15
 SIDE_PX, FOV_DEG, DISTANCE_M = 256, 20.0, 2.0
 PUPILS_MM, FOCI_DPT = (2.5, 5.5), (0.0, 1.0)
 MODES = ("dynamic", "on-axis")
@@ -377,40 +375,22 @@ def loaders(bank: EyeBank, count: int, n_workers: int) -> list[dict]:
     return found
 
 
-def main() -> None:
-    """Run from the command line."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--quick", action="store_true", help="three eyes")
-    parser.add_argument("--json", action="store_true", help="print the report alone")
-    options = parser.parse_args()
+def measure(run: Run) -> tuple[list[Row], dict[str, list[dict]]]:
+    """Return rows, and figures of banks, batches, workers and blurs."""
     os.environ[THREADS_VARIABLE] = "1"
     counts, n_workers = (COUNT, BANK_COUNT, EXACT_COUNT), N_WORKERS
     batch_counts = BATCH_COUNT, BANK_COUNT, EXACT_COUNT
-    if options.quick:
+    if run.is_quick:
         n_workers = QUICK_N_WORKERS
         counts = QUICK_COUNT, QUICK_BANK_COUNT, QUICK_EXACT_COUNT
         batch_counts = QUICK_BATCH_COUNT, QUICK_BANK_COUNT, QUICK_EXACT_COUNT
     rows: list[Row] = []
-    details: list[dict] = []
+    banks: list[dict] = []
     batches: list[dict] = []
     with tempfile.TemporaryDirectory() as name:
         for mode in MODES:
-            rows += run_mode(mode, counts, Path(name) / mode, details)
+            rows += run_mode(mode, counts, Path(name) / mode, banks)
             rows.append(run_batch(mode, Path(name), batch_counts, batches))
         workers = loaders(EyeBank(Path(name) / MODES[0]), counts[0], n_workers)
-    publish(
-        "ml",
-        rows,
-        as_json=options.json,
-        is_whole=not options.quick,
-        details={
-            "banks": details,
-            "batches": batches,
-            "workers": workers,
-            "blurs": blurs(counts[0]),
-        },
-    )
-
-
-if __name__ == "__main__":
-    main()
+    details = {"banks": banks, "batches": batches, "workers": workers}
+    return rows, details | {"blurs": blurs(counts[0])}

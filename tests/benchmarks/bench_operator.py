@@ -1,16 +1,13 @@
 """The linear operator of a frame and its adjoint: time beside error.
 
-    python -m tests.benchmarks.bench_operator [--quick] [--json]
-
 The courtyard at 480x270 and 1280x720 through six eyes, in a constant state.  The frame
 without merging, the operator and its adjoint take turns, after the first call of each.
 The error of the operator is its largest difference from the frame, relative to the
 brightest pixel; that of the adjoint is the difference of <A x, y> and <x, A' y>,
 relative to them, for random x and y from 0 to 1.  Below, the times of processors (all
-threads) and the ratios of medians.  Writes results/operator.json.
+threads) and the ratios of medians.
 """
 
-import argparse
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -27,11 +24,12 @@ from filter_service.rendering.media_effects import linear_from_srgb
 from filter_service.rendering.native import NativeRenderer
 from filter_service.rgbd_view import RgbdView
 from filter_service.view_state import State
-from tests.benchmarks.harness import WARM_UPS, Row, memory_mb, publish
+from tests.benchmarks.harness import WARM_UPS, Row, Run, memory_mb
 from tests.benchmarks.published_figures import CONDITIONS
 from tests.grid_specs import grid_spec
 from tests.numerical.scene_frames import scene_view
 
+MINUTES = 2
 SIZES, QUICK_SIZES = ((480, 270), (1280, 720)), ((240, 135),)
 COUNTS, QUICK_COUNT = (30, 12), 5
 STATE = State(4.5, 0.5)
@@ -137,29 +135,16 @@ def rows_of(
     )
 
 
-def main() -> None:
-    """Run from the command line."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--quick", action="store_true", help="240x135, one eye")
-    parser.add_argument("--json", action="store_true", help="print the report alone")
-    options = parser.parse_args()
+def measure(run: Run) -> tuple[list[Row], dict[str, list[dict]]]:
+    """Return rows, and ratios of times."""
     sizes, counts, eyes = SIZES, COUNTS, CONDITIONS
-    if options.quick:
+    if run.is_quick:
         sizes, counts, eyes = QUICK_SIZES, (QUICK_COUNT,), CONDITIONS[:1]
-    rows: list[Row] = []
-    ratios: list[dict[str, object]] = []
-    for size_px, count in zip(sizes, counts, strict=True):
-        view = linear_view(size_px)
-        for name in eyes:
-            rows += rows_of(view, name, count, ratios)
-    publish(
-        "operator",
-        rows,
-        as_json=options.json,
-        is_whole=not options.quick,
-        details={"ratios": ratios},
-    )
-
-
-if __name__ == "__main__":
-    main()
+    ratios: list[dict] = []
+    rows = [
+        row
+        for size_px, count in zip(sizes, counts, strict=True)
+        for name in eyes
+        for row in rows_of(linear_view(size_px), name, count, ratios)
+    ]
+    return rows, {"ratios": ratios}

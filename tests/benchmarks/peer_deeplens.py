@@ -4,9 +4,7 @@ from pathlib import Path
 
 from numpy.typing import NDArray
 
-from estimator.profiles.parse import parse_profile
-from tests.benchmarks.peer_optiland import eye_request
-from tests.benchmarks.peer_problem import Problem
+from tests.benchmarks.peer_problem import Peer, Problem
 from tests.benchmarks.peer_process import PeerProcess, require
 from tests.benchmarks.view_sources import EyeState
 
@@ -52,41 +50,19 @@ class DefocusFrames:
         self._process.close()
 
 
-def traced_psf(problem: Problem, state: EyeState, *, side_px: int, rays: int):
-    """Trace the green PSF on the axis of a centered eye.
-
-    Returns
-    -------
-    psf : (side, side)
-    taken_ms : float
-    """
-    require("deeplens-core")
-    camera = problem.spec.camera
-    left, right, _, _ = camera.tangents
-    eye = parse_profile(problem.profile).surfaces.relaxed
-    wavelength_nm = float(problem.spec.channel_wavelengths_nm[1])
-    process = PeerProcess(SCRIPT)
-    try:
-        answer = process.ask(
-            "psf",
-            eye=eye_request(eye, wavelength_nm),
-            wavelength_nm=wavelength_nm,
-            pupil_mm=state.pupil_diameter_mm,
-            pitch=(right - left) / camera.width_px,
-            side_px=side_px,
-            rays=rays,
-        )
-        return process.read("out.npy"), 1e3 * answer["seconds"]
-    finally:
-        process.close()
-
-
-def deeplens(mode: str, layers: int):
-    """Open a thin lens.
-
-    Parameters
-    ----------
-    mode : "render_rgbd" or "pillbox"
-    layers : int
-    """
-    return lambda problem: DefocusFrames(problem, mode, layers)
+THIN_LENS = (
+    "of a thin lens, over; no PSF, color or field. Does more: gradients, dual pixels"
+)
+PEERS = (
+    Peer(
+        "DeepLens render_rgbd",
+        f"16 layers, Gaussians within the circle of confusion {THIN_LENS}",
+        lambda problem: DefocusFrames(problem, "render_rgbd", 16),
+    ),
+    Peer(
+        "DeepLens discs",
+        "8 layers, which gave the smallest error, discs without antialiasing, divided "
+        f"by their coverage; {THIN_LENS}",
+        lambda problem: DefocusFrames(problem, "pillbox", 8),
+    ),
+)

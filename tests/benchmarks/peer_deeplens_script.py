@@ -4,9 +4,9 @@
 at the circle of confusion.  "pillbox" calls what that method calls, with the library's
 even discs and layers that are uniform in diopters, which is nearer to an eye.
 
-``psf`` traces rays through the surfaces of an eye, as a `deeplens.GeoLens`.  It treats
-what is behind an aperture as air and its sensor is flat, so the stop must be at the
-vertex of a surface, and only the axis is right.
+``gradient`` traces rays through the surfaces of an eye, as a `deeplens.GeoLens`.  It
+treats what is behind an aperture as air and its sensor is flat, so the stop must be at
+the vertex of a surface, and only the axis is right.
 """
 
 import json
@@ -105,22 +105,6 @@ def opened_lens(folder, eye, pupil_mm, pitch, side_px):
     return lens(stop_radius_mm, pixel_mm), pixel_mm
 
 
-def traced_psf(folder, eye, wavelength_nm, pupil_mm, pitch, side_px, rays):
-    """PSF of a point on the axis, by rays, and the seconds that it took."""
-    import torch
-
-    opened, _ = opened_lens(folder, eye, pupil_mm, pitch, side_px)
-    point = torch.tensor([[0.0, 0.0, -FARTHEST_MM]])
-    seconds = []
-    for _ in range(2):  # the first warms up
-        start_s = time.perf_counter()
-        with torch.no_grad():
-            psf = opened.psf(point, ks=side_px, wvln=wavelength_nm / 1000.0, spp=rays)
-        seconds.append(time.perf_counter() - start_s)
-    np.save(Path(folder) / "out.npy", psf[0].numpy())
-    return {"seconds": seconds[1]}
-
-
 def gradient(folder, eye, wavelength_nm, pupil_mm, pitch, rays):
     """Derivative of a PSF's sum, weighted with a blob, by the radius of the cornea."""
     import torch
@@ -204,7 +188,6 @@ if __name__ == "__main__":
         {
             "open": defocus.open,
             "frame": defocus.frame,
-            "psf": traced_psf,
             "gradient": gradient,
         }
     )

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from tests.benchmarks.peer_problem import NotInstalled, Problem
+from tests.benchmarks.peer_problem import NotInstalled, Peer, Problem
 from tests.benchmarks.view_sources import EyeState
 
 FRAMES = 8
@@ -97,3 +97,14 @@ def _filtered(program: str, color: NDArray, share: NDArray, frames: int = 1) -> 
         )
     found = np.frombuffer(answer.stdout, "<f4").reshape(frames, 3, height, width)[-1]
     return np.moveaxis(found[np.argsort(PLANES)], 0, -1)
+
+
+PEERS = (
+    Peer(
+        "ffmpeg varblur",
+        "gathers boxes of each pixel's own radius, never under 2 px; no occlusion, "
+        f"PSF, color or field; a process of {FRAMES} frames, its start in their time",
+        varblur,
+        frames_per_call=FRAMES,
+    ),
+)

@@ -251,45 +251,31 @@ def deeplens_gradient() -> Gradient:
     return Gradient(answer["gradient"], expected, 1e3 * answer["seconds"])
 
 
-@dataclass(frozen=True)
-class GradientMethod:
-    """A method of the table.
+def gradient_methods() -> list[tuple[str, Callable[[], Gradient], str, str]]:
+    """Return the methods of the table.
 
-    Attributes
-    ----------
-    gradient : callable
-        Raises `NotInstalled`.
-    reference, differs : str
-        What its error is measured against, and what it does otherwise or more.
+    Returns
+    -------
+    list of (name, gradient, reference, differs)
+        The gradient raises `NotInstalled`; the others say what its error is measured
+        against, and what it does otherwise or more.
     """
-
-    name: str
-    gradient: Callable[[], Gradient]
-    reference: str
-    differs: str
-
-
-def gradient_methods() -> list[GradientMethod]:
-    """Return the methods of the table."""
     expected, waves = expected_by_waves(), "quadrature of the PSF"
     whole = "the derivative of a whole image, in three equal colors"
     more = "Does more: gradients by all parameters of a lens at once"
-    own = [
-        GradientMethod(
-            f"ours, {accuracy}", partial(our_gradient, accuracy, expected), waves, whole
-        )
-        for accuracy in ACCURACIES
-    ]
     return [
-        *own,
-        GradientMethod(
+        *(
+            (f"ours, {name}", partial(our_gradient, name, expected), waves, whole)
+            for name in ACCURACIES
+        ),
+        (
             "optiland FFTPSF",
             partial(optiland_gradient, expected),
             waves,
             f"one color, float64. {more}. Backward differentiation by the position of "
             "the retina differs from differences of the same PSF",
         ),
-        GradientMethod(
+        (
             "DeepLens GeoLens",
             deeplens_gradient,
             "rays traced in double precision",

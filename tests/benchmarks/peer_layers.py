@@ -8,7 +8,13 @@ from scipy import fft
 
 from filter_service.constants import MIN_COVERAGE
 from tests.benchmarks.layered_baselines import _bounds, _widened
-from tests.benchmarks.peer_problem import KeptForState, NotInstalled, Problem
+from tests.benchmarks.peer_problem import (
+    LAYER_COUNT,
+    KeptForState,
+    NotInstalled,
+    Peer,
+    Problem,
+)
 from tests.benchmarks.view_sources import EyeState
 
 N_WORKERS = 2
@@ -202,3 +208,29 @@ def drawn_disc(radius_px: float) -> NDArray[np.float32]:
     side = 2 * reach + 1
     share = inside.reshape(side, EDGE_SAMPLES, side, EDGE_SAMPLES).mean(axis=(1, 3))
     return (share / share.sum()).astype(np.float32)
+
+
+PEERS = (
+    Peer(
+        "FFT linear",
+        f"{LAYER_COUNT} layers of exact PSFs with linear weights between, clamped "
+        "coverage near to far; no field",
+        fft_layers(linear=True),
+    ),
+    Peer(
+        "FFT over",
+        f"{LAYER_COUNT} layers of exact PSFs, far to near over each other: seams where "
+        "layers meet; no field",
+        fft_layers(linear=False),
+    ),
+    Peer(
+        "OpenCV disc",
+        f"{LAYER_COUNT} layers, even discs by geometry, over; no PSF, color or field",
+        opencv_layers("disc"),
+    ),
+    Peer(
+        "OpenCV Gaussian",
+        f"{LAYER_COUNT} layers, Gaussians, over; no PSF, color or field",
+        opencv_layers("gaussian"),
+    ),
+)

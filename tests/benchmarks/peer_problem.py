@@ -1,8 +1,8 @@
-"""What every peer of `bench_peers` is given, and what it has to offer.
+"""What every peer of `bench_peers` is given, what it has to offer, and ours.
 
-A peer is opened with a problem (a view, an eye on its axis) and then filters frames at
-states of that eye.  What a state needs it makes when the state is new and keeps while
-the state stays.
+A module of peers has ``PEERS``.  Each is opened with a problem (a view, an eye on its
+axis) and then filters frames at states of that eye.  What a state needs it makes when
+the state is new and keeps while the state stays.
 """
 
 from collections.abc import Callable
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from estimator.profiles.parse import parse_profile
 from filter_service.planning.grid import GridSpec
 from filter_service.psfs.eye_for_spec import eye_for_spec
+from filter_service.psfs.store import build_psf_store
 from filter_service.rgbd_view import RgbdView
 from tests.benchmarks.view_sources import EyeState, linear_color, view_sources
 from tests.grid_specs import grid_spec
@@ -144,3 +145,71 @@ class KeptForState:
         if self._of != key:
             self._kept, self._of = self._make(state), key
         return self._kept
+
+
+@dataclass(frozen=True)
+class Variant:
+    """Settings of ours that make a row of their own, as points of time and error.
+
+    Attributes
+    ----------
+    label : str
+        Behind the name of the engine.
+    settings : dict
+        Of the store, as ``{"tolerance": "fine"}``.
+    options : dict
+        Of each frame, as ``{"merge": False}``.
+    """
+
+    label: str = ""
+    settings: dict = field(default_factory=dict)
+    options: dict = field(default_factory=dict)
+
+
+TOLERANCES = (0.0, 0.05, 0.2, 1.0, 3.0, 8.0)
+"""From exact to fast: the curve of time against error."""
+
+UNCUT = {"kept_energy_ratio": 0.997}
+"""Kernels that keep more of their tails than a stream's, as one picture's do."""
+
+VARIANTS = (
+    *(
+        Variant(f"tolerance {tolerance:g}", options={"render_tolerance": tolerance})
+        for tolerance in TOLERANCES
+    ),
+    *(
+        Variant(f"{tolerance:g}, wider", UNCUT, {"render_tolerance": tolerance})
+        for tolerance in (0.05, 0.2)
+    ),
+)
+
+FINE = {"mode": "quality", "tolerance": "fine"}
+
+FIELD_VARIANTS = (
+    Variant("dynamic", {"mode": "dynamic"}),
+    Variant("quality", {"mode": "quality"}),
+    Variant("quality, fine", FINE),
+    Variant("fine, wider", {**FINE, **UNCUT}),
+)
+"""For PSFs that follow the visual field, whose spacing decides on time and error."""
+
+
+def ours(renderer, variant: Variant):
+    """Open a renderer with a store for all pupils and foci."""
+
+    def opened(problem: Problem):
+        spec = problem.spec_with(**variant.settings)
+        handle = renderer.load(build_psf_store(problem.eye, spec))
+
+        def frame(state: EyeState) -> NDArray:
+            return renderer.render(
+                problem.view,
+                handle,
+                pupil_diameter_mm=state.pupil_diameter_mm,
+                focus_dpt=state.focus_dpt,
+                **variant.options,
+            ).color
+
+        return frame
+
+    return opened

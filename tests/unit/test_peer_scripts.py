@@ -1,6 +1,7 @@
 """What the scripts of the peers compute themselves, without the peers."""
 
 import sys
+from argparse import Namespace
 
 import numpy as np
 import pytest
@@ -8,8 +9,8 @@ from scipy.signal import fftconvolve
 
 from estimator.profiles.parse import parse_profile
 from filter_service.planning.grid import pixel_from_mrad
-from tests.benchmarks import peer_gradients, peer_process
-from tests.benchmarks.bench_peers import line_of, printed_rows
+from tests.benchmarks import bench_peers, peer_gradients, peer_process
+from tests.benchmarks.harness import Run
 from tests.benchmarks.peer_deeplens_script import (
     kernel_side_px,
     lens_file,
@@ -178,10 +179,22 @@ def test_our_psfs_are_those_of_isetbio(number):
 
 
 def test_printed_figures_say_that_they_are_not_measured():
-    for row in printed_rows():
+    for row in bench_peers.printed_rows():
         assert row.n == 0
         assert row.setting == "not measured here"
-        assert row.published in line_of(row)
+        assert "The Visual Computer" in row.published
+
+
+def test_missing_packages_are_listed_and_the_other_rows_measured(tmp_path, monkeypatch):
+    monkeypatch.setattr(peer_process, "PYTHON", tmp_path / "python")
+    methods = [("peer", lambda: peer_process.require("optiland"), "", "")]
+    monkeypatch.setattr(bench_peers, "gradient_methods", lambda: methods)
+    run = Run(is_quick=True, options=Namespace(rows=["gradient", "printed"]))
+    rows, details = bench_peers.measure(run)
+    assert [row.method for row in rows] == ["light-gathering trees"]
+    missing = {"method": "peer", "not_installed": "optiland (sh setup.sh peers)"}
+    assert details["missing"] == [missing]
+    assert details["packages"][0]["optiland"] is None
 
 
 ANSWERS = """
