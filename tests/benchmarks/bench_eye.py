@@ -25,7 +25,7 @@ from estimator import Eye, perfect_transfer
 from estimator.acuity.transfer import neural_sensitivity
 from estimator.optics.zernike import nm_from_index
 from tests.benchmarks.harness import Row, memory_mb, publish
-from tests.benchmarks.peer_isetbio import moved_light, published_psfs
+from tests.isetbio_psfs import moved_light, published_psfs
 from tests.reference import pupil_sums
 
 PERFECT = {

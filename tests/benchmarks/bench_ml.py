@@ -50,7 +50,7 @@ from PIL import Image
 from estimator.threads import THREADS_VARIABLE
 from filter_service import Camera, EyeBank, EyeFilter, FilterSettings
 from tests.benchmarks.harness import Row, Run, memory_mb, time_calls
-from tests.benchmarks.loader_workers import SeenPictures, digest, measured
+from tests.loader_workers import SeenPictures, digest, measured
 from tests.numerical.scene_frames import scene_view
 
 MINUTES = 15

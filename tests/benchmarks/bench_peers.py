@@ -43,7 +43,6 @@ from tests.benchmarks.frame_runs import WARM_UPS, states_towards
 from tests.benchmarks.harness import Row, Run, memory_mb
 from tests.benchmarks.image_measures import channel_psnr_db
 from tests.benchmarks.peer_gradients import SETTING, gradient_methods
-from tests.benchmarks.peer_isetbio import moved_light, our_psf, published_psfs
 from tests.benchmarks.peer_problem import (
     FIELD_VARIANTS,
     VARIANTS,
@@ -53,6 +52,7 @@ from tests.benchmarks.peer_problem import (
     ours,
 )
 from tests.benchmarks.peer_process import peer_versions
+from tests.isetbio_psfs import moved_light, our_psf, published_psfs
 from tests.numerical.scene_frames import scene_view
 
 MINUTES = 12

@@ -22,8 +22,8 @@ from estimator.acuity.transfer import (
 )
 from estimator.media import Straylight
 from tests.benchmarks.bench_eye import isetbio_psf
-from tests.benchmarks.peer_isetbio import moved_light, published_psfs
 from tests.human_data import published_log_mar
+from tests.isetbio_psfs import moved_light, published_psfs
 from tests.reference import pupil_sums
 
 PERFECT = {

@@ -23,7 +23,7 @@ from estimator.optics.zernike import (
     zernike_gradient,
     zernike_values,
 )
-from tests.benchmarks.peer_isetbio import zernike_term
+from tests.isetbio_psfs import zernike_term
 
 DATA = Path(__file__).parents[1] / "data"
 

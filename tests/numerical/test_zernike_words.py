@@ -7,7 +7,7 @@ from estimator.optics import prescription as rx
 from estimator.optics.zernike import index_from_nm
 from estimator.optics.zernike_words import DIRECTIONS, describe_zernike
 from estimator.psf.compute import compute_psfs
-from tests.benchmarks.peer_isetbio import zernike_term
+from tests.isetbio_psfs import zernike_term
 
 PUPIL_MM, WAVELENGTH_NM = 5.0, 550.0
 TERMS = {

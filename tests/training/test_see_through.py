@@ -20,7 +20,7 @@ from filter_service import (
     image_derivatives,
 )
 from ocufilter.torch import SeeThrough
-from tests.benchmarks.loader_workers import SeenPictures, digest, loaded_by_torch
+from tests.loader_workers import SeenPictures, digest, loaded_by_torch
 from tests.source_tree import ROOT
 
 SETTINGS = FilterSettings(mode="on-axis", eye_model="wavefront")

@@ -8,7 +8,7 @@ import pytest
 
 from filter_service import EyeBank, FilterSettings
 from filter_service.camera import Camera
-from tests.benchmarks.loader_workers import SeenPictures, digest, loaded
+from tests.loader_workers import SeenPictures, digest, loaded
 
 CAMERA = Camera.from_fov(8.0, width_px=48, height_px=32)
 SETTINGS = FilterSettings(

@@ -16,13 +16,6 @@ from tests.benchmarks.peer_deeplens_script import (
     lens_file,
     lens_numbers,
 )
-from tests.benchmarks.peer_isetbio import (
-    MRAD_PER_ARCMIN,
-    moved_light,
-    our_psf,
-    published_psfs,
-    zernike_term,
-)
 from tests.benchmarks.peer_optiland import EYE, eye_request
 from tests.benchmarks.peer_optiland_script import (
     Camera,
@@ -34,6 +27,13 @@ from tests.benchmarks.peer_optiland_script import (
 )
 from tests.benchmarks.peer_problem import NotInstalled
 from tests.grid_specs import grid_spec
+from tests.isetbio_psfs import (
+    MRAD_PER_ARCMIN,
+    moved_light,
+    our_psf,
+    published_psfs,
+    zernike_term,
+)
 
 pytestmark = pytest.mark.tools
 

@@ -1,6 +1,6 @@
 """Processes that filter images as the workers of a data loader do.
 
-    python -m tests.benchmarks.loader_workers FILE METHOD WORKERS [--torch]
+    python -m tests.loader_workers FILE METHOD WORKERS [--torch]
 
 FILE is a pickled `SeenPictures`, METHOD "fork" or "spawn".  Prints JSON: the processor
 time of a worker until its first image, with its interpreter and imports; the PSS of all
@@ -180,7 +180,7 @@ def measured(
         found: dict[str, Any] = json.loads(
             subprocess.run(
                 [
-                    *(sys.executable, "-m", "tests.benchmarks.loader_workers"),
+                    *(sys.executable, "-m", "tests.loader_workers"),
                     *(path, method, str(n_workers), *["--torch"][: int(with_torch)]),
                 ],
                 env=variables,
@@ -200,6 +200,6 @@ def main() -> None:
 
 if __name__ == "__main__":
     # Under its own name, so that workers that are spawned import this module.
-    from tests.benchmarks.loader_workers import main as run
+    from tests.loader_workers import main as run
 
     run()

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from estimator.optics.zernike import nm_from_index, rescale_pupil
 from estimator.psf.compute import compute_psf_batch
 
-FILE = Path(__file__).parents[1] / "data" / "isetbio_psfs.npz"
+FILE = Path(__file__).parent / "data" / "isetbio_psfs.npz"
 
 WAVELENGTH_NM = 550.0
 MEASURED_PUPIL_MM = 6.0
