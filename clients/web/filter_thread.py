@@ -2,7 +2,8 @@
 
 The page's event loop never filters; it submits a request here and continues. A newer
 request replaces one that has not been started. The preview follows at once, and the
-full picture after a pause without input; new input cancels it.
+full picture after a pause without input; new input cancels it.  A single step after a
+rest is usually the only one, so the eye of its full picture is estimated in the pause.
 
 The preview uses the on-axis wavefront from a formula and takes some hundredths of a
 second; the full picture uses the eye ray-traced over its field.
@@ -23,7 +24,7 @@ from typing import Any, Literal
 from clients.web.comparison import EyeName
 from clients.web.eye_form import depends_on_gaze
 from clients.web.picture import Picture, coarser, jpeg_of, png_of
-from filter_service import EyeFilter, FilterError, FilterSettings
+from filter_service import EyeFilter, FilterError, FilterSettings, RgbdView
 from filter_service.messages import State, WithState
 from filter_service.settings import Pipeline
 
@@ -111,30 +112,11 @@ class EyeView:
     def picture(self, kind: Kind, request: PictureRequest) -> SentPicture | None:
         """Return a preview or a full picture; None while its eye is being prepared."""
         start_s = time.monotonic()
-        body = request.bodies[self.side]
         if kind == "preview":
             self._stop_full(request)
-            settings, view = QUICK, request.picture.small
-            if depends_on_gaze(body):
-                settings = settings.changed(gaze_deg=request.gaze_deg)
-        else:
-            view = request.picture.view
-            settings = FULL.changed(
-                gaze_deg=request.gaze_deg, pipeline=request.pipeline
-            )
-            if self._merge_factor > 1:
-                view = coarser(view, self._merge_factor)
-        settings = settings.covering(foci_dpt=(request.focus_dpt,))
-        if kind not in self._filters:
-            # A preview's eye is a formula, prepared in this thread within milliseconds.
-            # In the worker it would wait for the estimate of an outdated full picture,
-            # or for a new process if that had to be killed: up to 6 s.
-            self._filters[kind] = EyeFilter(worker=kind != "preview")
-        eye_filter, profile = self._filters[kind], (body, settings, view.camera)
+        settings, view = self._seen_with(kind, request)
         try:
-            if profile != self._profiles.get(kind):
-                self._profiles[kind] = profile
-                eye_filter.set_profile(body, settings=settings, views=view.camera)
+            eye_filter = self._prepared(kind, request, settings, view)
             seen = eye_filter.try_filter(
                 [view],
                 pupil_diameter_mm=request.pupil_diameter_mm,
@@ -166,6 +148,48 @@ class EyeView:
         }
         return SentPicture(kind, self.side, request.number, data, facts)
 
+    def estimate(self, request: PictureRequest) -> None:
+        """Start to estimate the eye of a full picture; errors follow in `picture`."""
+        with suppress(FilterError):
+            self._prepared("full", request, *self._seen_with("full", request))
+
+    def _seen_with(
+        self, kind: Kind, request: PictureRequest
+    ) -> tuple[FilterSettings, RgbdView]:
+        """Return the settings and the view of a kind of picture."""
+        if kind == "preview":
+            settings, view = QUICK, request.picture.small
+            if depends_on_gaze(request.bodies[self.side]):
+                settings = settings.changed(gaze_deg=request.gaze_deg)
+        else:
+            view = request.picture.view
+            settings = FULL.changed(
+                gaze_deg=request.gaze_deg, pipeline=request.pipeline
+            )
+            if self._merge_factor > 1:
+                view = coarser(view, self._merge_factor)
+        return settings.covering(foci_dpt=(request.focus_dpt,)), view
+
+    def _prepared(
+        self,
+        kind: Kind,
+        request: PictureRequest,
+        settings: FilterSettings,
+        view: RgbdView,
+    ) -> EyeFilter:
+        """Return the filter of a kind of picture, with the requested eye."""
+        body = request.bodies[self.side]
+        if kind not in self._filters:
+            # A preview's eye is a formula, prepared in this thread within milliseconds.
+            # In the worker it would wait for the estimate of an outdated full picture,
+            # or for a new process if that had to be killed: up to 6 s.
+            self._filters[kind] = EyeFilter(worker=kind != "preview")
+        profile = body, settings, view.camera
+        if profile != self._profiles.get(kind):
+            self._filters[kind].set_profile(body, settings=settings, views=view.camera)
+            self._profiles[kind] = profile
+        return self._filters[kind]
+
     def _stop_full(self, request: PictureRequest) -> None:
         """Cancel the full eye if it is outdated, to free the worker."""
         if "full" not in self._profiles:
@@ -195,6 +219,7 @@ class _Page:
     show: Callable[[SentPicture], Any]
     newest: PictureRequest | None = None
     arrived_s: float = 0.0
+    is_single: bool = False  # the newest request came after a rest
     current: PictureRequest | None = None
     begun_s: float = 0.0
     eyes: dict[EyeName, EyeView] = field(default_factory=dict)
@@ -218,6 +243,10 @@ class _Page:
             return None
         pause_s = self.arrived_s + PAUSE_S - now_s
         if pause_s > 0.0:
+            if self.is_single:
+                self.is_single = False
+                for side in request.bodies:
+                    self.eyes[side].estimate(request)
             return pause_s
         self._show("full", request)
         if request is not self.newest:
@@ -274,7 +303,9 @@ class FilterThread:
         """Request a picture; an older request is dropped."""
         known = self._pages.get(page)
         if known is not None:
-            known.newest, known.arrived_s = request, time.monotonic()
+            now_s = time.monotonic()
+            known.is_single = now_s > known.arrived_s + PAUSE_S
+            known.newest, known.arrived_s = request, now_s
             self._wake.set()
 
     def forget(self, page: str) -> None:
