@@ -32,3 +32,4 @@ from .wavefront import rms_by_order_um as rms_by_order_um
 from .wavefront import rms_um as rms_um
 from .wavefront import terms_figure as terms_figure
 from .wavefront import wavefront_map_figure as wavefront_map_figure
+from .wavefront import wavefront_range_um as wavefront_range_um

@@ -206,6 +206,14 @@ def in_circle(n: int) -> NDArray[np.bool_]:
     return np.hypot(along, along[:, None]) <= 1.0
 
 
+def wavefront_range_um(
+    zernike_um: NDArray[np.float64], *, from_order: int = LOWEST_BLURRING_ORDER
+) -> float:
+    """Return the largest deviation of a wavefront (28,), for the scale of its map."""
+    values = wavefront_values_um(zernike_um, from_order=from_order)
+    return max(float(np.abs(values[in_circle(SIDE_COUNT)]).max()), MIN_RANGE_UM)
+
+
 def draw_wavefront_map(
     axes: Axes,
     zernike_um: NDArray[np.float64],
@@ -214,6 +222,7 @@ def draw_wavefront_map(
     eye_side: str,
     from_order: int = LOWEST_BLURRING_ORDER,
     title: str = "",
+    range_um: float | None = None,
 ) -> None:
     """Draw a map, facing the person: a right eye's temporal side is on the left.
 
@@ -221,6 +230,8 @@ def draw_wavefront_map(
     ----------
     zernike_um : (28,)
         Coefficients in the eye's frame, x to the person's right.
+    range_um : float, optional
+        Upper end of the color scale; by default, `wavefront_range_um` of the map.
     """
     rms = rms_um(zernike_um, from_order=from_order)
     if rms < LEAST_RMS_UM:
@@ -229,7 +240,8 @@ def draw_wavefront_map(
         _draw_no_map(axes, title, known)
         return
     values = wavefront_values_um(zernike_um, from_order=from_order)[:, ::-1]
-    top = max(float(np.abs(values[in_circle(SIDE_COUNT)]).max()), MIN_RANGE_UM)
+    top = wavefront_range_um(zernike_um, from_order=from_order)
+    top = top if range_um is None else range_um
     drawn = axes.imshow(
         values,
         extent=(-radius_mm, radius_mm) * 2,

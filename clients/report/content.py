@@ -26,6 +26,7 @@ from clients.figures import (
     draw_through_focus_acuity,
     draw_wavefront_map,
     draw_wavefront_maps,
+    wavefront_range_um,
 )
 from clients.figures.study import PUPILS_MM
 from clients.figures.style import LITERAL, TITLE_PT
@@ -440,8 +441,14 @@ def _psfs(study: EyeStudy, label: str, sides_arcmin: tuple[float, float]) -> Plo
 
 
 def _map(study: EyeStudy, label: str, studies: tuple[EyeStudy, ...]) -> Plot:
-    """Return the higher orders of one eye on the smaller of both circles."""
+    """Return the higher orders of one eye: on the smaller circle, in equal colors."""
     radius_mm = min(other.found.zernike_radius_mm for other in studies)
+    range_um = max(
+        wavefront_range_um(
+            on_circle_um(other, radius_mm), from_order=LOWEST_HIGHER_ORDER
+        )
+        for other in studies
+    )
     return on_axes(
         lambda axes: draw_wavefront_map(
             axes,
@@ -450,6 +457,7 @@ def _map(study: EyeStudy, label: str, studies: tuple[EyeStudy, ...]) -> Plot:
             eye_side=study.profile.eye_side,
             from_order=LOWEST_HIGHER_ORDER,
             title=f"{label}\norders 3 to 6{study.assumed_suffix}",
+            range_um=range_um,
         ),
         PAIR_MAP_MM,
         f"Map of the higher orders: {label}",

@@ -24,6 +24,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from clients.figures import (
     EyeStudy,
+    PupilWavefront,
     acuity_log_mar,
     cross_section_figure,
     draw_acuity_of_several,
@@ -31,6 +32,7 @@ from clients.figures import (
     draw_mtf_of_several,
     draw_through_focus_acuity,
     draw_wavefront_map,
+    wavefront_range_um,
 )
 from clients.figures.curves import blur_arcmin, draw_field_map
 from clients.figures.style import new_figure
@@ -222,6 +224,11 @@ def eye_figures(
         )
         return _png(figure)
     state = {"pupil_diameter_mm": pupil_diameter_mm, "focus_dpt": focus_dpt}
+    if name == "wavefront":
+        waves = [_wavefront(body, **state) for body in bodies]
+        state["range_um"] = max(wavefront_range_um(w.zernike_um) for w in waves)
+        if len(bodies) > 1:
+            labels = [f"{label} (same colors)" for label in labels]
     pictures = [eye_figure(name, body, **state) for body in bodies]
     return pictures[0] if len(pictures) == 1 else joined_png(pictures, labels)
 
@@ -232,8 +239,22 @@ def _png(figure: Figure) -> bytes:
     return file.getvalue()
 
 
+def _wavefront(
+    body: str, *, pupil_diameter_mm: float, focus_dpt: float
+) -> PupilWavefront:
+    """Return the wavefront of an eye for the distance that it looks at."""
+    return _study(body).wavefront(
+        pupil_diameter_mm, object_dpt=focus_dpt, focus_dpt=focus_dpt
+    )
+
+
 def eye_figure(
-    name: str, body: str, *, pupil_diameter_mm: float, focus_dpt: float
+    name: str,
+    body: str,
+    *,
+    pupil_diameter_mm: float,
+    focus_dpt: float,
+    range_um: float | None = None,
 ) -> bytes:
     """Return a figure of one eye as a PNG.
 
@@ -242,6 +263,8 @@ def eye_figure(
     name : one of `FIGURE_TITLES`
     body : str
         The profile as JSON, which is the cache key of the eye.
+    range_um : float, optional
+        Upper end of the color scale of a wavefront.
     """
     study = _study(body)
     if name == "field":
@@ -256,8 +279,8 @@ def eye_figure(
         figure = new_figure(95.0, 75.0)
         draw_mtf(figure.subplots(), study)
     else:
-        seen = study.wavefront(
-            pupil_diameter_mm, object_dpt=focus_dpt, focus_dpt=focus_dpt
+        seen = _wavefront(
+            body, pupil_diameter_mm=pupil_diameter_mm, focus_dpt=focus_dpt
         )
         figure = new_figure(95.0, 75.0)
         draw_wavefront_map(
@@ -266,6 +289,7 @@ def eye_figure(
             radius_mm=seen.circle_diameter_mm / 2.0,
             eye_side=study.profile.eye_side,
             title=f"Focused at {focus_dpt:.2f} dpt",
+            range_um=range_um,
         )
     return _png(figure)
 
