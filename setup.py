@@ -112,19 +112,24 @@ class AnyPythonWheel(bdist_wheel):
         return "py3", "none", super().get_tag()[2]
 
 
+IS_EDITABLE = "editable_wheel" in sys.argv
+SHADERS = ("", ".common", ".draws", ".passes")
+"""Packages in `filter_service.shaders`, which is a top-level folder in a checkout.
+
+An editable installation has none of them: it puts the checkout on Python's path.  With
+packages that are elsewhere, setuptools would install a finder instead, to which Python
+prefers any folder named ``ocufilter``, such as a clone in the folder of a script.
+"""
+
 setup(
     cmdclass={"bdist_wheel": AnyPythonWheel, "build_ext": BuildLibraries},
     packages=[
         *find_packages(
             include=["clients*", "estimator*", "filter_service*", "ocufilter"]
         ),
-        # part of filter_service in a wheel, but a top-level folder in a checkout
-        "filter_service.shaders",
-        "filter_service.shaders.common",
-        "filter_service.shaders.draws",
-        "filter_service.shaders.passes",
+        *(() if IS_EDITABLE else (f"filter_service.shaders{name}" for name in SHADERS)),
     ],
-    package_dir={"filter_service.shaders": "shaders"},
+    package_dir={"": "."} if IS_EDITABLE else {"filter_service.shaders": "shaders"},
     # Libraries are loaded by path.  All are marked as optional so that the build goes
     # on to the end, where `BuildLibraries` says what is missing.
     ext_modules=[

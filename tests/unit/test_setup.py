@@ -1,6 +1,7 @@
 """What installs the project agrees with itself."""
 
 import importlib
+import os
 import re
 import subprocess
 import sys
@@ -36,6 +37,17 @@ def _required() -> list[str]:
 def test_every_requirement_has_a_pin():
     pinned = {_normal(name) for name in PINNED}
     assert [name for name in _required() if _normal(name) not in pinned] == []
+
+
+def test_a_script_beside_a_clone_imports_the_package(tmp_path):
+    (tmp_path / "ocufilter").mkdir()  # as `git clone` names it
+    script = tmp_path / "script.py"
+    script.write_text("from ocufilter import Camera\nprint(Camera.__name__)\n")
+    bare = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}
+    finished = subprocess.run(
+        [sys.executable, script], cwd=tmp_path, env=bare, capture_output=True, text=True
+    )
+    assert finished.stdout == "Camera\n", finished.stderr
 
 
 def test_without_a_compiler_the_build_asks_for_that_of_pypi(monkeypatch):
