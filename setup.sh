@@ -110,6 +110,11 @@ install_system_libraries() {
     fi
     missing=$(missing_packages $SYSTEM_PACKAGES $REPORT_PACKAGES)
     if [ -n "$missing" ] && ! apt_install $missing; then
+        if [ -z "$(missing_packages $SYSTEM_PACKAGES)" ]; then
+            say "no reports as PDF without $missing;" \
+                "to install:  $(install_command "$missing")"
+            return
+        fi
         say "missing system packages: $missing"
         say "install them and run this again:  $(install_command "$missing")"
         exit 1

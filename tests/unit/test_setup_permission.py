@@ -118,6 +118,15 @@ def test_without_a_terminal_the_missing_package_is_named_with_the_command(run):
     assert finished.system == []
 
 
+def test_packages_for_reports_are_optional(run):
+    finished = run("setup.sh", missing="libpango-1.0-0")
+    assert finished.returncode == 0, finished.stderr
+    assert f"no reports as PDF without libpango-1.0-0; to install:  {COMMAND}" in (
+        finished.stderr
+    )
+    assert finished.system == []
+
+
 @pytest.mark.parametrize(
     ("arguments", "variables"),
     [(("--yes",), {}), ((), {"OCUFILTER_SETUP_YES": "1"}), (("test", "--yes"), {})],
