@@ -8,6 +8,7 @@ import re
 import shlex
 from dataclasses import dataclass
 from functools import cache
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -29,6 +30,9 @@ PAGES = tuple(
 SHELLS = ("sh", "console", "powershell")
 OTHER = ("{", "client     ", "[header]", "# an .abp file")
 """How indented blocks begin that are no commands: JSON, diagrams, files."""
+
+WAYS_PAGE = "docs/how-to/choose.md"
+"""The first lines of each way to use ocufilter."""
 
 ENDPOINT = "tcp://127.0.0.1:5577"
 ENDLESS = ("serve", "web", "layer serve", "layer run", "headset --left")
@@ -171,6 +175,24 @@ def commands_of(page: str) -> tuple[Command, ...]:
                 found += [Command(page, first, text)] if text else []
                 whole = ""
     return tuple(found)
+
+
+def ways_in() -> dict[str, list[Command]]:
+    """Return the commands of each way to use ocufilter on the page that lists them.
+
+    A way is a heading, or bold text at the beginning of a line; the commands below a
+    heading that contains others, such as "Service", end at the first of those.
+    """
+    lines = (ROOT / WAYS_PAGE).read_text(encoding="utf-8").split("\n")
+    found: dict[str, list[Command]] = {}
+    starts = []
+    for number, line in enumerate(lines, 1):
+        name = re.match(r"###? (.*)|\*\*(.*?)\.\*\*", line)
+        if name:
+            starts.append((number, name[1] or name[2]))
+    for (start, name), (end, _) in pairwise([*starts, (len(lines), "")]):
+        found[name] = [c for c in commands_of(WAYS_PAGE) if start < c.line < end]
+    return found
 
 
 def commands_of_help() -> list[Command]:

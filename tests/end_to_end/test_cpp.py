@@ -25,6 +25,7 @@ from filter_service.wire.replies import Result, ResultView
 from tests.benchmarks.mutated_messages import mutated
 from tests.end_to_end.conftest import QUICK_DOUBLE, TIMEOUT_S
 from tests.end_to_end.test_lifecycle import wait_until
+from tests.page_commands import WAYS_PAGE
 from tests.unit.message_parts import REPLIES, as_bytes
 
 FOLDER = CHECKOUT / "clients" / "cpp"
@@ -503,7 +504,8 @@ def printed_line():
     """Return the command that compiles the example, in the file and on the page."""
     source = (FOLDER / "example.cpp").read_text(encoding="utf-8")
     (line,) = re.findall(r"^// {5}(g\+\+ .*)$", source, re.MULTILINE)
-    assert line in (FOLDER / "README.md").read_text(encoding="utf-8")
+    for page in (FOLDER / "README.md", CHECKOUT / WAYS_PAGE):
+        assert line in page.read_text(encoding="utf-8")
     return line
 
 
@@ -559,7 +561,7 @@ def fenced(page):
 @pytest.mark.clients
 def test_the_lines_of_the_pages_run(compile_program, real_service, tmp_path):
     include, _, readme = fenced(FOLDER / "README.md").partition("\n\n")
-    way_in = fenced(CHECKOUT / "docs" / "how-to" / "choose.md")
+    way_in = fenced(CHECKOUT / WAYS_PAGE)
     text = f"""{include}
         #include <cstdio>
         int main() {{

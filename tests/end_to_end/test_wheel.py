@@ -17,7 +17,15 @@ from PIL import Image
 
 from clients.service_process import ServiceProcess
 from tests.end_to_end import test_documentation, test_examples
-from tests.page_commands import ENDPOINT, PAGES, SLOW, commands_of, make_files
+from tests.page_commands import (
+    ENDPOINT,
+    PAGES,
+    SLOW,
+    WAYS_PAGE,
+    commands_of,
+    make_files,
+    ways_in,
+)
 from tests.release.smoke import REQUEST
 from tests.source_tree import ROOT
 
@@ -218,6 +226,27 @@ def test_public_names_and_the_command_line_need_no_checkout(installed):
     assert module.stdout == command.stdout != "", module.stderr
 
 
+def test_the_printed_lines_install_the_wheel(wheel, tmp_path):
+    lines = [command.text for command in ways_in()["Wheel"]]
+    (name,) = re.findall(r"ocufilter-.*\.whl", "\n".join(lines))
+    shutil.copy(wheel, tmp_path / name)
+    # Its dependencies are those of this environment, without a network.
+    packages = ":".join({sysconfig.get_path("purelib"), sysconfig.get_path("platlib")})
+    finished = subprocess.run(
+        ["bash", "-ec", "\n".join(lines)],
+        cwd=tmp_path,
+        env=os.environ
+        | {"PIP_NO_DEPS": "1", "PIP_NO_INDEX": "1", "PYTHONPATH": packages},
+        capture_output=True,
+        text=True,
+        timeout=TIMEOUT_S,
+    )
+    assert finished.returncode == 0, finished.stdout + finished.stderr
+    own = tmp_path / "ocufilter-env"
+    assert list(own.glob("lib/python*/site-packages/filter_service/native/_loops.so"))
+    assert "serve" in finished.stdout
+
+
 def test_doctor_finds_a_machine_that_can_serve(run_json):
     report = run_json("doctor")
     assert report["ok"]
@@ -399,6 +428,9 @@ def test_an_example_runs(installed, path, tmp_path):
 @pytest.mark.parametrize(
     ("page", "file"),
     [
+        (WAYS_PAGE, ".config/systemd/user/ocufilter.service"),
+        (WAYS_PAGE, "ocufilter-js/filter_client.js"),
+        (WAYS_PAGE, "ocufilter-cpp/example.cpp"),
         ("docs/how-to/deploy.md", ".config/systemd/user/ocufilter.service"),
         ("clients/js/README.md", "ocufilter-js/filter_client.js"),
         ("clients/cpp/README.md", "ocufilter-cpp/ocufilter.hpp"),

@@ -50,7 +50,8 @@ SYSTEM_PACKAGES="monado-service monado-cli libopenxr1-monado libopenxr-loader1
     libvulkan-dev vulkan-validationlayers
     openxr-layer-apidump openxr-layer-corevalidation
     xserver-xorg-core xserver-xorg-video-dummy"
-PYTHON_PACKAGES="pytest pyopenxr>=1.1,<1.2 trimesh networkx"
+# setuptools and prometheus_client for the steps of Containerfile
+PYTHON_PACKAGES="pytest pyopenxr>=1.1,<1.2 trimesh networkx setuptools prometheus_client"
 APPLICATION_PACKAGES="octave-psychtoolbox-3 blender libdbus-1-3 libfontconfig1
     libglib2.0-0t64 libxcb-cursor0 libxcb-icccm4 libxcb-image0 libxcb-keysyms1
     libxcb-randr0 libxcb-render-util0 libxcb-render0 libxcb-shape0 libxcb-util1

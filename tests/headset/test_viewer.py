@@ -15,6 +15,7 @@ from tests.headset.monado import Monado, Pose, RemoteHead
 from tests.headset.program import Program
 from tests.headset.rooms import stripes
 from tests.headset.test_runtime import EYES, HEADS, SOON, pose_error
+from tests.page_commands import ways_in
 
 N_FRAMES = 300
 LONG = "100000"
@@ -95,6 +96,17 @@ def test_frames_with_both_layers_are_taken_and_eyes_differ(started, tmp_path, ro
     left, right = shown[-1]["rows"]
     assert contrast(left) > 2 * CONTRAST
     assert contrast(right) < CONTRAST
+
+
+def test_the_printed_line_shows_a_scene(started, tmp_path):
+    (command,) = (c for c in ways_in()["OpenXR"] if c.is_one_of(["headset"]))
+    brief = ("--frames", "30", "--scale", "0.2")
+    with Viewer(started(), tmp_path, *command.arguments[1:], *brief) as viewer:
+        lines = list(viewer.lines())
+        assert viewer.exit_code() == 0, viewer.said
+    (report,) = [line for line in lines if "filtered" in line]
+    assert report["filtered"] == 30
+    assert "myopia" in viewer.said and "keratoconus" in viewer.said
 
 
 def test_views_are_where_the_headset_is(started, tmp_path, room):

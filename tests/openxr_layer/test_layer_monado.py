@@ -16,6 +16,7 @@ from clients.openxr_layer.program import LIBRARY_VARIABLE
 from tests.headset.monado import Monado
 from tests.headset.rooms import stripes
 from tests.openxr_layer.programs import VALIDATION
+from tests.page_commands import ways_in
 
 N_FRAMES = 300
 TIMEOUT_S = 120
@@ -166,6 +167,24 @@ def test_hello_xr_with_vulkan(run, tmp_path):
     assert report["fallback"] == 0
     assert np.mean(picture.max(axis=2) > 20) > 0.9, "black"
     assert [line for line in said.splitlines() if VALIDATION.search(line)] == []
+
+
+@needs_hello_xr
+@pytest.mark.parametrize(
+    "command",
+    [c for c in ways_in()["OpenXR"] if c.is_one_of(["layer run"])],
+    ids=lambda command: command.words[-1],
+)
+def test_the_printed_lines_filter_hello_xr(run, display, tmp_path, command):
+    options = command.arguments[2:]
+    with Monado(tmp_path, screen=True, variables=HALF_SIZE) as monado:
+        with run(monado, *PATIENT, *options, DISPLAY=display) as program:
+            program.wait_until(lambda said: said.count("eye: ready") == 2)
+            time.sleep(2.0)
+            code, report = program.report()
+    assert code in (0, 128 + signal.SIGINT)
+    assert report["shown_filtered"] >= 10
+    assert report["fallback"] == 0
 
 
 @needs_hello_xr
