@@ -26,6 +26,7 @@ from mkdocs.structure.files import File, Files
 from filter_service.service.config import RANGES, ServiceConfig
 from filter_service.settings import DEFAULTS, setting_help, setting_types
 from filter_service.validation import allowed_values
+from tests.benchmarks.harness import KEPT_RESULTS
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = {
@@ -183,8 +184,10 @@ def _benchmarks_page() -> str:
 
 def _result_line(path: Path) -> str:
     content = json.loads(path.read_text(encoding="utf-8"))
-    facts = [f"commit {content['commit'].rstrip('+')}" if "commit" in content else ""]
+    facts = [f"commit {content['commit']}" if "commit" in content else ""]
     facts += [content.get("date") or "", content.get("machine", {}).get("cpu", "")]
+    if path.stem in KEPT_RESULTS:
+        facts.append("not repeated by `make results`")
     return f"- [{path.name}](../results/{path.name}) {', '.join(filter(None, facts))}"
 
 

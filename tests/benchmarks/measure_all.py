@@ -3,8 +3,8 @@
     python -m tests.benchmarks results [NAMES] [--plan] [--no-wait] [--out DIR]
 
 Runs the named benchmarks, or all, one after the other, and writes results/NAME.json and
-pictures.  Every file records the commit, which is the last that changed anything but
-results and documents, and the minutes that the run took.
+pictures, and then the tables of the documents.  Every file records the commit, which is
+the last that changed anything but results and documents, and the minutes of the run.
 
 - A tree with uncommitted changes of other files is refused.
 - Benchmarks that were measured at this commit are skipped, so that a run that was ended
@@ -33,6 +33,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from filter_service.progress import Progress, Task
+from tests.benchmarks import tables
 from tests.benchmarks.harness import KEPT_RESULTS, OUT, RESULTS, ROOT, git
 
 FOLDER = Path(__file__).parent
@@ -94,11 +95,7 @@ IN_CHROOT = ("layer",)
 """Benchmarks that run in the chroot, where the checkout is read-only: their result is
 the JSON object that they print."""
 
-OTHERS = {
-    "paper_layouts": ("paper_page.layouts",),
-    "paper_figures": ("paper_page.pictures", "--out", "{out}"),
-    "gpu_forecast": ("gpu_forecast",),
-}
+OTHERS = {"paper_figures": ("paper_page.pictures", "--out", "{out}")}
 """Programs that write a result and are no benchmarks: module and arguments."""
 
 
@@ -375,4 +372,5 @@ def main(arguments: list[str]) -> int:
     for name, error in errors.items():
         print(f"failed: {name}: {error}")
     print(f"{len(chosen) - len(errors)} results in {options.out}")
-    return 1 if errors else 0
+    is_incomplete = bool(errors) or (not is_trial and tables.main() != 0)
+    return 1 if is_incomplete else 0

@@ -3,14 +3,14 @@
 Writes what stands between ``<!-- results: NAME -->`` and ``<!-- /results -->`` in the
 documents: a table, with commit, date and machine below it, or a figure in a sentence.
 tables.toml defines them.  ``head`` are the headings of the labels of rows.  A column
-may be several cells, which stand in one; without rows, it is a figure.
+may be several cells, which stand in one.  ``figures`` are single cells.
 
 A cell has the keys of ``common``, its column and its row; later ones replace earlier
 ones.  ``text`` is its format, whose fields are expressions of the fields of a row, and
 of ``value``, an expression, too.  Keys other than `CELL_KEYS` are fields that the row
 has: as written, or as a regular expression, whose named groups are fields, too;
 ``where`` is a condition.  If several rows match, a field becomes "LEAST to LARGEST", or
-the one that ``over`` names (min, max); otherwise ``over`` separates the texts of rows.
+the one that ``over`` names (`ONE_OF`); otherwise ``over`` separates the texts of rows.
 If none matches, the cell is ``missing``, or else an error.
 """
 
@@ -21,14 +21,17 @@ import sys
 import tomllib
 from functools import cache
 from pathlib import Path
+from statistics import median_low
 
 from tests.benchmarks.harness import RESULTS, ROOT
 
 TABLES = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
 SETS = TABLES.pop("sets")
+TABLES |= {name: {"common": cell} for name, cell in TABLES.pop("figures").items()}
 MARKED = re.compile(r"(<!-- results: (\w+) -->)(.*?)(<!-- /results -->)", re.DOTALL)
 FOLDERS = ("docs", "shaders", "training", "filter_service", "estimator", "clients")
 CELL_KEYS = {"text", "value", "where", "result", "part", "over", "missing"}
+ONE_OF = {"min": min, "max": max, "median": median_low}
 Cell = dict[str, str]
 
 
@@ -70,9 +73,9 @@ def _shown(values: list, spec: str, over: str) -> str:
     texts = [format(value, spec) for value in values]
     if spec.endswith("f"):  # no negative zero
         texts = [t.lstrip("-") if float(t) == 0.0 else t for t in texts]
+    if over in ONE_OF:
+        return texts[values.index(ONE_OF[over](values))]
     low, high = (texts[values.index(of(values))] for of in (min, max))
-    if over != "to":
-        return low if over == "min" else high
     return low if low == high else f"{low} to {high}"
 
 
@@ -100,7 +103,7 @@ def cell_text(cell: Cell) -> str:
         if not matching:
             raise NoRow(f"{cell['result']}.json has no row for {cell}")
         over = cell.get("over", "to")
-        if over in ("to", "min", "max"):
+        if over == "to" or over in ONE_OF:
             return _formatted(cell["text"], matching, over)
         return over.join(_formatted(cell["text"], [row], "min") for row in matching)
     except NoRow:
@@ -157,7 +160,7 @@ def made_text(name: str) -> str:
     Raises
     ------
     NoRow
-        If there is no such table, or a result lacks something for it.
+        If there is no such table, or a result lacks a row of it.
     """
     try:
         return table_text(TABLES[name])

@@ -40,7 +40,7 @@ class Checkout:
         self.benchmarks.mkdir(parents=True)
         for name in ("__main__.py", "harness.py", "measure_all.py", "tables.py"):
             shutil.copy(ROOT / "tests" / "benchmarks" / name, self.benchmarks)
-        (self.benchmarks / "tables.toml").write_text("[sets]\n")
+        (self.benchmarks / "tables.toml").write_text("[sets]\n[figures]\n")
         for name, wait_s in (("one", 0.0), ("slow", 60.0)):
             text = GOOD.format(name=name, wait_s=wait_s)
             self.bench(name).write_text(text)
