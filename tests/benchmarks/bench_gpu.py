@@ -80,8 +80,6 @@ from tests.benchmarks.pass_work import (
 )
 
 MINUTES = 4
-QUICK_NAMES = dict(zip(VIEWS, ("192x108", "192x108", "2 x 96x100"), strict=True))
-"""The small view that stands for a large one."""
 HOST_STAGES = ("prepare_ms", "psf_plan_ms", "plan_ms", "upload_ms", "readback_ms")
 """Stages that are not passes: by the wall clock, but for the upload, whose timer on the
 GPU waits for the processor to copy."""
@@ -105,64 +103,48 @@ class PassRow(Row):
     bound_ms: float | None
 
 
-@dataclass(frozen=True)
-class Pace:
-    """How many frames are timed, after how many seconds of others."""
-
-    count: int
-    warm_s: float
+Pace = tuple[int, float]
+PACE, QUICK_PACE = (60, 1.5), (3, 0.0)
+"""How many frames are timed, after how many seconds of others."""
 
 
-QUICK_PACE = Pace(3, 0.0)
-PACE = Pace(60, 1.5)
-
-
-class Rows:
-    """Rows of a case whose state changes or stays."""
-
-    def __init__(
-        self, case: Case | TextureCase, rates: Rates | None, *, is_moving: bool
-    ):
-        self._case, self._rates, self._is_moving = case, rates, is_moving
-        self._work = case.work.passes()
-
-    def of(self, times_ms: dict[str, Any]) -> Iterator[Row]:
-        """Yield a row for each name; those of passes have their work."""
-        how = "moving" if self._is_moving else "frozen"
-        for name, values in times_ms.items():
-            row = Row(
-                bench="gpu",
-                method=name,
-                case=self._case.eye,
-                setting=f"{self._case.setting} {how}",
-                n=len(values),
-                median_ms=float(np.median(values)),
-                p95_ms=float(np.percentile(values, 95)),
-                memory_mb=self._case.memory_mb,
-                error_name="psnr_db",
-                error=self._case.error_db,
-                reference=REFERENCE,
-            )
-            work = self._work.get(name.strip()) if name.startswith("    ") else None
-            # Of a state that stays, nothing is planned and blended.
-            if work is None or (name.strip() in STATE_STAGES and not self._is_moving):
-                yield row
-                continue
-            bound_ms = None if self._rates is None else work.bound_ms(self._rates)
-            yield PassRow(**asdict(row), **asdict(work), bound_ms=bound_ms)
+def rows_of(
+    case: Case | TextureCase,
+    times_ms: dict[str, Any],
+    rates: Rates | None,
+    *,
+    is_moving: bool,
+) -> Iterator[Row]:
+    """Yield a row for each name; those of passes have their work."""
+    works = case.work.passes()
+    for name, values in times_ms.items():
+        row = Row(
+            *("gpu", name, case.eye),
+            f"{case.setting} {'moving' if is_moving else 'frozen'}",
+            *(len(values), *np.percentile(values, (50, 95)).tolist()),
+            *(case.memory_mb, "psnr_db", case.error_db, REFERENCE),
+        )
+        work = works.get(name.strip()) if name.startswith("    ") else None
+        # Of a state that stays, nothing is planned and blended.
+        if work is None or (name.strip() in STATE_STAGES and not is_moving):
+            yield row
+            continue
+        bound_ms = None if rates is None else work.bound_ms(rates)
+        yield PassRow(**asdict(row), **asdict(work), bound_ms=bound_ms)
 
 
 def frames_of(
     case: Case | TextureCase, pace: Pace, *, is_moving: bool
 ) -> Callable[[Callable[[dict], Any]], list]:
     """Return a function that calls another with the state of each frame."""
+    count, warm_s = pace
     spec = case.handles[0].store.spec
-    states = states_towards(spec, PUPIL_MM, FOCUS_DPT, pace.count if is_moving else 1)
+    states = states_towards(spec, PUPIL_MM, FOCUS_DPT, count if is_moving else 1)
 
     def frames(function: Callable[[dict], Any]) -> list:
-        return [function(states[k % len(states)]) for k in range(pace.count)]
+        return [function(states[k % len(states)]) for k in range(count)]
 
-    end_s, n = time.perf_counter() + pace.warm_s, 0
+    end_s, n = time.perf_counter() + warm_s, 0
     while time.perf_counter() < end_s or n < 3:
         case.frame(states[n % len(states)])
         n += 1
@@ -226,11 +208,11 @@ def case_rows(gpu: Gpu, case: Case, pace: Pace) -> Iterator[Row]:
         textures = TextureCase(case)
         for is_moving in (False, True):
             times_ms = texture_times(textures, pace, is_moving=is_moving)
-            yield from Rows(textures, rates, is_moving=is_moving).of(times_ms)
+            yield from rows_of(textures, times_ms, rates, is_moving=is_moving)
         textures.release()
     for is_moving in (True, False):
         times_ms = array_times(case, pace, is_moving=is_moving)
-        yield from Rows(case, rates, is_moving=is_moving).of(times_ms)
+        yield from rows_of(case, times_ms, rates, is_moving=is_moving)
 
 
 def counted_frame(gpu: Gpu, eye: str, size_px: tuple[int, int]) -> FrameWork:
@@ -309,9 +291,7 @@ def measure(run: Run) -> tuple[list[Row], dict[str, list[dict]]]:
         return forecast_rows(works, measured), {}
     if gpu.is_software and not run.is_quick:
         sys.exit("bench gpu: no hardware GPU; allowed: --quick, --forecast")
-    views = {name: VIEWS[name] for name in names}
-    if run.is_quick:
-        views = {QUICK_NAMES[name]: QUICK_VIEWS[QUICK_NAMES[name]] for name in names}
+    views = QUICK_VIEWS if run.is_quick else {name: VIEWS[name] for name in names}
     rows: list[Row] = []
     clocks: list[dict] = []
     kept = KeptRows("gpu")

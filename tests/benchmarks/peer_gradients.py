@@ -222,6 +222,7 @@ def _timed(gradient: Callable[[], float], expected: float) -> Gradient:
 def _asked(script: str, package: str, **arguments) -> dict:
     """Return the answer of a peer to the request of a gradient."""
     require(package)
+    require("torch")
     process = PeerProcess(Path(__file__).with_name(script))
     eye = parse_profile(eye_profile()).surfaces.relaxed
     try:

@@ -13,6 +13,7 @@ import argparse
 import json
 import sys
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -64,26 +65,14 @@ CORNERS = {
 }
 
 
-@dataclass(frozen=True)
-class Figure:
-    """One figure of the paper: which eyes, and whether over the visual field."""
-
-    number: int
-    eyes: tuple[str, ...]
-    on_axis: bool
-
-    @property
-    def methods(self) -> dict[str, str]:
-        """Methods of `bench_field`, with the names that the picture shows."""
-        return ON_AXIS_METHODS if self.on_axis else FIELD_METHODS
-
-
-FIGURES = (
-    Figure(9, LOW_ORDER, on_axis=True),
-    Figure(10, MIXED, on_axis=True),
-    Figure(11, LOW_ORDER, on_axis=False),
-    Figure(12, MIXED, on_axis=False),
-)
+FIGURES = {
+    # number: eyes, and whether PSFs are those of the axis
+    9: (LOW_ORDER, True),
+    10: (MIXED, True),
+    11: (LOW_ORDER, False),
+    12: (MIXED, False),
+}
+BY_NAME = {method.name: method for method in METHODS}
 
 
 @dataclass(frozen=True)
@@ -94,32 +83,27 @@ class Cell:
     text: str
 
 
-def part_of(scene: str, size: tuple[int, int], *, on_axis: bool) -> Window:
-    """Return the part of a picture that is compared."""
-    left, top = CORNERS[scene, on_axis]
-    width_px, height_px = size
-    corner = (round(left * width_px), round(top * height_px))
-    return Window(*corner, width_px // 4, height_px // 4)
-
-
-def row_cells(renderer, figure: Figure, eye: str, scene: str, size):
+def row_cells(renderer, eye: str, scene: str, size, *, on_axis: bool):
     """Cells of one eye and scene, and the errors of its methods in dB."""
-    view = scene_view(scene, width_px=size[0], height_px=size[1])
+    width_px, height_px = size
+    view = scene_view(scene, width_px=width_px, height_px=height_px)
     bench = EyeBench(renderer, eye, [view])
-    window = part_of(scene, size, on_axis=figure.on_axis)
-    exact = bench.exact_state(STATE, on_axis=figure.on_axis)
-    if figure.on_axis:  # quick as a whole, where PSFs are of distance alone
+    left, top = CORNERS[scene, on_axis]
+    corner = (round(left * width_px), round(top * height_px))
+    window = Window(*corner, width_px // 4, height_px // 4)
+    exact = bench.exact_state(STATE, on_axis=on_axis)
+    if on_axis:  # quick as a whole, where PSFs are of distance alone
         truth = window.of(dense_reference(view, exact, bins=True))
     else:
         truth = dense_reference(view, exact, bins=False, window=window)
     cells, errors_db = [], {}
-    by_name = {method.name: method for method in METHODS}
-    for name, title in figure.methods.items():
-        color = by_name[name].run(bench, view, STATE, 1)[-1].color
+    for name, title in (ON_AXIS_METHODS if on_axis else FIELD_METHODS).items():
+        color = BY_NAME[name].run(bench, view, STATE, 1)[-1].color
         error_db = channel_psnr_db(window.of(color), truth)
         errors_db[name] = error_db
         cells.append(Cell(_srgb(window.of(color)), f"{title}: {error_db:.1f} dB"))
-    whole = Cell(_srgb(_framed(color, window)), _title(eye, scene))
+    title = f"{EYE_TITLES.get(eye, eye)}, {SCENE_TITLES[scene]}"
+    whole = Cell(_srgb(_framed(color, window)), title)
     bench.release()
     return [whole, *cells, Cell(_srgb(truth), "exact PSF of every pixel")], errors_db
 
@@ -128,13 +112,12 @@ def first_figure(renderer, size) -> list[list[Cell]]:
     """Figure 1: a very myopic eye, without and with its periphery."""
     view = scene_view("courtyard", width_px=size[0], height_px=size[1])
     bench = EyeBench(renderer, "myopia", [view])
-    by_name = {method.name: method for method in METHODS}
     cells = []
     for name, text in (
         ("ours on-axis", "myopia, the PSFs of its axis everywhere"),
         ("ours quality", "myopia, over the whole visual field"),
     ):
-        color = by_name[name].run(bench, view, STATE, 1)[-1].color
+        color = BY_NAME[name].run(bench, view, STATE, 1)[-1].color
         cells.append(Cell(_srgb(color), text))
     bench.release()
     return [cells]
@@ -168,42 +151,31 @@ def _framed(color: NDArray, window: Window) -> NDArray:
     framed = np.array(color)
     top, left = window.y, window.x
     bottom, right = top + window.height_px, left + window.width_px
-    for rows, columns in (
-        (slice(top - 1, top + 1), slice(left, right)),
-        (slice(bottom - 1, bottom + 1), slice(left, right)),
-        (slice(top, bottom), slice(left - 1, left + 1)),
-        (slice(top, bottom), slice(right - 1, right + 1)),
-    ):
-        framed[rows, columns] = FRAME_RGB
+    for y in (top, bottom):
+        framed[y - 1 : y + 1, left:right] = FRAME_RGB
+    for x in (left, right):
+        framed[top:bottom, x - 1 : x + 1] = FRAME_RGB
     return framed
-
-
-def _title(eye: str, scene: str) -> str:
-    return f"{EYE_TITLES.get(eye, eye)}, {SCENE_TITLES[scene]}"
 
 
 def render(out: Path, *, quick: bool, progress: Progress) -> dict:
     """Render every figure into a folder; errors of each, and where they are from."""
     size = QUICK_SIZE if quick else SIZE
-    scenes = tuple(SCENE_TITLES)
-    eyes = {f.number: f.eyes[:1] if quick else f.eyes for f in FIGURES}
-    total = 1 + sum(len(eyes[f.number]) * len(scenes) for f in FIGURES)
-    task = progress.task("Rendering figures", total=total, unit="rows")
+    task = progress.task("Rendering figures", total=1 + len(FIGURES), unit="figures")
     renderer = open_renderer()
     out.mkdir(parents=True, exist_ok=True)
     _save(sheet(first_figure(renderer, size), (640, 360)), out, 1)
     task.advance()
     errors = []
-    for figure in FIGURES:
+    for number, (eyes, on_axis) in FIGURES.items():
         rows = []
-        for eye in eyes[figure.number]:
-            for scene in scenes:
-                cells, errors_db = row_cells(renderer, figure, eye, scene, size)
-                rows.append(cells)
-                place = {"figure": figure.number, "eye": eye, "scene": scene}
-                errors.append({**place, "psnr_db": errors_db})
-                task.advance()
-        _save(sheet(rows, CELL_PX), out, figure.number)
+        for eye, scene in product(eyes[:1] if quick else eyes, SCENE_TITLES):
+            cells, errors_db = row_cells(renderer, eye, scene, size, on_axis=on_axis)
+            rows.append(cells)
+            place = {"figure": number, "eye": eye, "scene": scene}
+            errors.append({**place, "psnr_db": errors_db})
+        _save(sheet(rows, CELL_PX), out, number)
+        task.advance()
     content = {
         "machine": {**machine_info(), "renderer": renderer.name},
         "commit": commit_id(),
