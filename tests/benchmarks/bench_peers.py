@@ -30,7 +30,7 @@ are not installed: `sh setup.sh peers` installs what can be installed.
 import time
 from argparse import ArgumentParser
 from collections.abc import Iterator
-from contextlib import closing, suppress
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from importlib.metadata import PackageNotFoundError, version
 
@@ -223,30 +223,20 @@ def peer_rows(problem: Problem, case: str, peers: list[Peer], repeats) -> list[P
     ]
 
 
-def flat_rows(view, repeats: int) -> list[PeerRow]:
-    """Rows of a flat scene through PSFs that change over the visual field."""
+def flat_rows(view, repeats: int) -> Iterator[PeerRow]:
+    """Yield rows of a flat scene through PSFs that change over the visual field."""
     problem = peer_optiland.flat_problem(view)
-    try:
-        optiland = peer_optiland.Optiland(problem)
-    except NotInstalled:
-        return list(_flat_rows(problem, repeats, None))
-    with closing(optiland):
-        return list(_flat_rows(problem, repeats, optiland))
-
-
-def _flat_rows(problem: Problem, repeats: int, optiland) -> Iterator[PeerRow]:
-    view, state = problem.view, problem.state(**STATE)
+    view, state, theirs = problem.view, problem.state(**STATE), None
+    with suppress(NotInstalled):
+        theirs = peer_optiland.reference(problem, state)
     edge_px = round(EDGE_RATIO * view.height_px)
     inner = (slice(edge_px, -edge_px),) * 2
     sides = [
         ("dense, bins of 0.2 deg", dense_reference(view, state, bins=True)),
-        (
-            "dense, PSFs of optiland at points 20 px apart",
-            optiland and optiland.reference(state),
-        ),
+        ("dense, PSFs of optiland at points 20 px apart", theirs),
     ]
     ours_first = our_peers(FIELD_VARIANTS)
-    peers = [*ours_first, *peer_optiland.optiland_peers(optiland)]
+    peers = [*ours_first, *peer_optiland.PEERS]
     for line in measured(problem, peers, repeats):
         (own, other) = sides if line["peer"] in ours_first else sides[::-1]
         own_db, other_db = (
@@ -332,8 +322,8 @@ def layer_rows(*, is_quick: bool) -> Iterator[PeerRow]:
         yield from peer_rows(problem, case, [*our_peers(), *peers], repeats)
 
 
-def field_rows(*, is_quick: bool) -> list[PeerRow]:
-    """Rows of a flat picture over the visual field."""
+def field_rows(*, is_quick: bool) -> Iterator[PeerRow]:
+    """Return rows of a flat picture over the visual field."""
     width_px, height_px = QUICK_SIZE if is_quick else FLAT_SIZE
     view = scene_view("courtyard", width_px=width_px, height_px=height_px)
     return flat_rows(view, QUICK_REPEATS if is_quick else REPEATS)

@@ -8,6 +8,7 @@ compared with the other side's too, which includes how their PSFs differ.
 import hashlib
 import json
 import math
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,7 +21,7 @@ from estimator.profiles.parse import parse_profile
 from filter_service.rgbd_view import RgbdView
 from tests.benchmarks.dense_reference import CACHE
 from tests.benchmarks.peer_problem import Peer, Problem
-from tests.benchmarks.peer_process import PeerProcess, require
+from tests.benchmarks.peer_process import PeerFrames, PeerProcess, require
 from tests.benchmarks.view_sources import EyeState
 
 SCRIPT = Path(__file__).with_name("peer_optiland_script.py")
@@ -88,90 +89,65 @@ def eye_request(eye: EyeSurfaces, wavelength_nm: float) -> dict:
     }
 
 
-class Optiland:
-    """optiland with a problem's picture, eye and camera.
+def _request(problem: Problem) -> dict:
+    """Return the eye and the camera for the script."""
+    camera = problem.spec.camera
+    eye = parse_profile(problem.profile).surfaces.relaxed
+    wavelengths_nm = [float(w) for w in problem.spec.channel_wavelengths_nm]
+    return {
+        "eye": [eye_request(eye, w) for w in wavelengths_nm],
+        "wavelengths_nm": wavelengths_nm,
+        "tangents": list(camera.tangents),
+        "size_px": [camera.width_px, camera.height_px],
+    }
 
-    Attributes
-    ----------
-    own_ms : float
-        Of the last frame, without the exchange of files.
+
+def reference(problem: Problem, state: EyeState) -> NDArray:
+    """Filter the picture with optiland's PSFs of many field points, once.
+
+    Raises
+    ------
+    NotInstalled
     """
+    require("optiland")
+    request = _request(problem)
+    words = json.dumps([request, state.pupil_diameter_mm])
+    digest = hashlib.sha256(words.encode() + SCRIPT.read_bytes())
+    digest.update(np.ascontiguousarray(problem.color).tobytes())
+    path = CACHE / f"optiland_{digest.hexdigest()[:24]}.npy"
+    if not path.exists():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with closing(PeerProcess(SCRIPT)) as process:
+            process.write("color.npy", problem.color)
+            process.ask("open", **request)
+            process.ask("reference", pupil_mm=state.pupil_diameter_mm)
+            np.save(path, process.read("out.npy"))
+    return np.load(path)
 
-    def __init__(self, problem: Problem):
-        require("optiland")
-        camera = problem.spec.camera
-        eye = parse_profile(problem.profile).surfaces.relaxed
-        wavelengths_nm = [float(w) for w in problem.spec.channel_wavelengths_nm]
-        self._request = {
-            "eye": [eye_request(eye, w) for w in wavelengths_nm],
-            "wavelengths_nm": wavelengths_nm,
-            "tangents": list(camera.tangents),
-            "size_px": [camera.width_px, camera.height_px],
-        }
-        self._color = problem.color
-        self._process = PeerProcess(SCRIPT)
-        self._process.write("color.npy", problem.color)
-        self._process.ask("open", **self._request)
-        self.own_ms = 0.0
 
-    def frame(self, state: EyeState, shape, n_components: int) -> NDArray:
-        """Filter the picture with eigen-PSFs."""
-        answer = self._process.ask(
-            "frame",
-            pupil_mm=state.pupil_diameter_mm,
-            shape=shape,
-            n_components=n_components,
+def optiland(shape: tuple[int, int], n_components: int):
+    """Open the filter with PSFs of field points, reduced to eigen-PSFs."""
+
+    def opened(problem: Problem) -> PeerFrames:
+        return PeerFrames(
+            *(SCRIPT, "optiland", {"color.npy": problem.color}, _request(problem)),
+            lambda state: {
+                "pupil_mm": state.pupil_diameter_mm,
+                "shape": shape,
+                "n_components": n_components,
+            },
         )
-        self.own_ms = 1e3 * answer["seconds"]
-        return self._process.read("out.npy")
 
-    def reference(self, state: EyeState) -> NDArray:
-        """Filter the picture with optiland's PSFs of many field points, once."""
-        words = json.dumps([self._request, state.pupil_diameter_mm])
-        digest = hashlib.sha256(words.encode() + SCRIPT.read_bytes())
-        digest.update(np.ascontiguousarray(self._color).tobytes())
-        path = CACHE / f"optiland_{digest.hexdigest()[:24]}.npy"
-        if not path.exists():
-            path.parent.mkdir(parents=True, exist_ok=True)
-            self._process.ask("reference", pupil_mm=state.pupil_diameter_mm)
-            np.save(path, self._process.read("out.npy"))
-        return np.load(path)
-
-    def close(self) -> None:
-        """End the process."""
-        self._process.close()
+    return opened
 
 
-class _EigenFrames:
-    def __init__(self, optiland: Optiland, shape, n_components: int):
-        self._optiland, self._basis = optiland, (shape, n_components)
-
-    def __call__(self, state: EyeState) -> NDArray:
-        return self._optiland.frame(state, *self._basis)
-
-    @property
-    def own_ms(self) -> float:
-        return self._optiland.own_ms
-
-
-def optiland_peers(optiland: Optiland | None) -> list[Peer]:
-    """Return the rows of optiland, or rows that it is not installed."""
-
-    def opened(shape, n_components):
-        def frames(problem: Problem):
-            if optiland is None:
-                require("optiland")
-            return _EigenFrames(optiland, shape, n_components)
-
-        return frames
-
-    return [
-        Peer(
-            f"optiland {shape[1]}x{shape[0]}, {n_components}",
-            "mean and eigen-PSFs of that many field points, computed anew for every "
-            "pupil; one distance, no occlusion, and the edge of the image darkens. "
-            "Does more: distortion, freeform surfaces, polarization, gradients (torch)",
-            opened(shape, n_components),
-        )
-        for shape, n_components in BASES
-    ]
+PEERS = tuple(
+    Peer(
+        f"optiland {shape[1]}x{shape[0]}, {n_components}",
+        "mean and eigen-PSFs of that many field points, computed anew for every "
+        "pupil; one distance, no occlusion, and the edge of the image darkens. "
+        "Does more: distortion, freeform surfaces, polarization, gradients (torch)",
+        optiland(shape, n_components),
+    )
+    for shape, n_components in BASES
+)

@@ -84,6 +84,44 @@ class PeerProcess:
         self._folder.cleanup()
 
 
+class PeerFrames:
+    """The frames of a script: a function of states.
+
+    Parameters
+    ----------
+    script : Path
+    package : str
+        What the script needs; raises `NotInstalled` without it.
+    arrays, opening : dict
+        Files that the script reads, and the arguments of its task "open".
+    arguments : callable
+        From a state to the arguments of its task "frame".
+
+    Attributes
+    ----------
+    own_ms : float
+        Of the last frame, without the exchange of files.
+    """
+
+    def __init__(self, script: Path, package: str, arrays, opening, arguments):
+        require(package)
+        self._arguments, self.own_ms = arguments, 0.0
+        self._process = PeerProcess(script)
+        for name, values in arrays.items():
+            self._process.write(name, values)
+        self._process.ask("open", **opening)
+
+    def __call__(self, state) -> NDArray:
+        """Filter the picture in a state."""
+        answer = self._process.ask("frame", **self._arguments(state))
+        self.own_ms = 1e3 * answer["seconds"]
+        return self._process.read("out.npy")
+
+    def close(self) -> None:
+        """End the script."""
+        self._process.close()
+
+
 def peer_versions(packages) -> dict[str, str | None]:
     """Return versions of packages in the environment; None if missing."""
     if not PYTHON.exists():

@@ -137,8 +137,8 @@ def wide_view():
 
 
 def test_two_sides_agree_about_a_flat_scene(wide_view, monkeypatch):
-    monkeypatch.setattr(peer_optiland, "BASES", peer_optiland.BASES[:3])
-    rows = flat_rows(wide_view, 1)
+    monkeypatch.setattr(peer_optiland, "PEERS", peer_optiland.PEERS[:3])
+    rows = list(flat_rows(wide_view, 1))
     for row in rows:
         if row.missing is not None:
             pytest.skip(f"not installed: {row.missing}")
@@ -153,7 +153,7 @@ def test_ours_is_measured_where_the_other_side_is_missing(
     wide_view, monkeypatch, tmp_path
 ):
     monkeypatch.setattr(peer_process, "PYTHON", tmp_path / "python")
-    rows = flat_rows(wide_view, 1)
+    rows = list(flat_rows(wide_view, 1))
     ours = [row for row in rows if row.method.startswith("ours")]
     assert all(row.error > 40.0 and row.other_error is None for row in ours)
     missing = {row.missing for row in rows if row not in ours}
