@@ -1,70 +1,68 @@
 """The tables and figures of the paper beside ours: where each value comes from."""
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+import tomllib
+from collections.abc import Mapping, Sequence
+from functools import cache
+from itertools import product
 
 from tests.benchmarks.paper_page.measured import Measured
-from tests.benchmarks.paper_page.published import published, section, table, words
+from tests.benchmarks.paper_page.published import (
+    FOLDER,
+    published,
+    section,
+    table,
+    words,
+)
 from tests.benchmarks.paper_page.rows import Block, Line, Measure, Section
 
 NAMES = words()["names"]
 EYES, SYSTEMS, SCENES = NAMES["eyes"], NAMES["systems"], NAMES["scenes"]
 SCENE_TITLES, STEP_TITLES = NAMES["scene_titles"], NAMES["step_titles"]
-LARGE, SMALL = "1280x720", "640x360"
-MIB, GIB, HOUR = 1e6 / 2**20, 1e6 / 2**30, 1.0 / 3.6e6
+LARGE = "1280x720"
 SECONDS, MILLISECONDS = Measure("time", "s"), Measure("time", "ms")
 DECIBELS = Measure("PSNR", "dB", higher_is_better=True)
-LAYERS = Measure("layers", "layers")
-MIBS, GIBS = Measure("memory", "MiB"), Measure("memory", "GiB")
-MAKING = "making a frame's PSFs"
+MEASURES = {
+    "dB": DECIBELS,
+    "layers": Measure("layers", "layers"),
+    **{unit: Measure("memory", unit) for unit in ("MiB", "GiB")},
+    **{unit: Measure("time", unit) for unit in ("h", "ms", "s")},
+    **{
+        name: Measure(name, "ms")
+        for name in ("time to the first frame", "time of a frame")
+    },
+}
+SCALES = {"MiB": 1e6 / 2**20, "GiB": 1e6 / 2**30, "h": 1.0 / 3.6e6, "s": 1e-3}
+"""Of the units of blocks, from megabytes and milliseconds."""
+
 ERROR_NAMES = ("mean_abs_um", "mean_abs_mm")
 
 
-@dataclass(frozen=True)
-class From:
-    """Where a value of each eye comes from.
+@cache
+def blocks_of_sections() -> dict:
+    """Return the content of `blocks.toml`."""
+    return tomllib.loads((FOLDER / "blocks.toml").read_text(encoding="utf-8"))
 
-    Attributes
+
+def value(measured: Measured, source: dict | list | None, eye: str):
+    """Return the value of an eye; None where there is none.
+
+    Parameters
     ----------
-    file, column : str
-    where : dict
-        Other columns of the row and their values.
-    scale : float
-        From the column's unit to that of the block.
-    cases : dict
-        Names of eyes in the file, where they differ.
-    otherwise : From or None
-        Where to look if there is no such row.
-    read : callable or None
-        From the column to the value, instead of ``scale``.
+    source : dict, list of dict or None
+        Where it comes from, as `blocks.toml` says.
+    eye : str
+        Its name in the file.
     """
-
-    file: str
-    column: str
-    where: Mapping
-    scale: float = 1.0
-    cases: Mapping[str, str] = field(default_factory=dict)
-    otherwise: "From | None" = None
-    read: Callable | None = None
-
-    def value(self, measured: Measured, eye: str):
-        """Return the value of an eye; None where there is none."""
-        case = self.cases.get(eye, eye)
-        found = measured.value(self.file, self.column, case=case, **self.where)
-        if found is None:
-            return self.otherwise and self.otherwise.value(measured, eye)
-        return self.read(found) if self.read else found * self.scale
-
-
-def in_field(column: str, method: str, scene: str, size: str, **more) -> From:
-    """Return a column of field.json."""
-    where = {"method": method, "scene": SCENES.get(scene, scene), "size": size}
-    return From("field", column, where, **more)
-
-
-def in_layers(column: str, method: str, mode: str, **more) -> From:
-    """Return a column of layers.json."""
-    return From("layers", column, {"method": method, "setting": f"{mode}*"}, **more)
+    for one in source if isinstance(source, list) else [source]:
+        where = {**(one or {"file": ""}), "case": eye}
+        file, scale = where.pop("file"), where.pop("scale", None)
+        column = where.pop("column", "")
+        found = measured.value(file, column, **where) if file else None
+        if isinstance(found, str):  # the number of kernels, in words
+            return found.split(": ")[1].split(";")[0]
+        if found is not None:
+            return found * SCALES.get(scale, 1.0)
+    return None
 
 
 def eye_block(
@@ -72,22 +70,79 @@ def eye_block(
     system: str,
     measure: Measure,
     own: Mapping[str, float] | None,
-    sources: tuple[From | None, ...],
+    sources: Sequence[dict | list | None],
+    *,
+    cases: Mapping[str, str] | None = None,
     **more,
 ) -> Block:
     """Make a block with a line for each eye.
 
     ``own`` are the published figures; ``sources`` are of ours, of the system built
-    anew, and of ours in the same conditions, as many as there are.
+    anew, and of ours in the same conditions, as many as there are; ``cases`` are the
+    eyes, by their names in the files.
     """
     lines = [
         Line(
             *(EYES[eye], own[eye] if own else None),
-            *(source and source.value(measured, eye) for source in sources),
+            *(
+                value(measured, source, (cases or {}).get(eye, eye))
+                for source in sources
+            ),
         )
-        for eye in own or EYES
+        for eye in EYES
+        if cases is None or eye in cases
     ]
     return Block(system, measure, tuple(lines), **more)
+
+
+def _filled(content, names: Mapping[str, str]):
+    """Replace the {names} in strings."""
+    if isinstance(content, str):
+        return content.format(**names)
+    if isinstance(content, list):
+        return [_filled(part, names) for part in content]
+    if isinstance(content, dict):
+        return {key: _filled(part, names) for key, part in content.items()}
+    return content
+
+
+def listed_section(measured: Measured, number: str) -> Section:
+    """Return a section whose blocks are those of `blocks.toml`."""
+    content = blocks_of_sections()[number]
+    blocks = []
+    for group in content["group"]:
+        for parts in product(group["for"], group.get("and", [{}])):
+            names = {key: name for part in parts for key, name in part.items()}
+            names["system"] = SYSTEMS.get(names.get("method"), "")
+            names["scene_title"] = SCENE_TITLES.get(names.get("scene"), "")
+            names["our_scene"] = SCENES.get(names.get("scene"), "")
+            shared = {
+                k: v for k, v in group.items() if k not in ("for", "and", "block")
+            }
+            for block in group["block"]:
+                own = _filled({"system": "{system}", **shared, **block}, names)
+                if own.pop("only", names.get("scene")) != names.get("scene"):
+                    continue
+                blocks.append(_listed_block(measured, own, set(names.values())))
+    return section(number, content["origins"], blocks)
+
+
+def _listed_block(measured: Measured, own: dict, names: set[str]) -> Block:
+    path = own.pop("published", None)
+    printed = None
+    if path is not None:
+        for key in path:
+            printed = table(int(key)) if printed is None else printed[key]
+        printed = {
+            eye: float(cell.split()[0]) if isinstance(cell, str) else cell
+            for eye, cell in printed.items()
+        }
+    sources = [own.pop(name, None) for name in ("ours", "rebuilt", "there")]
+    is_own = (own.pop("own", None) in names) or own.pop("is_own", False)
+    measure = MEASURES[own.pop("measure")]
+    return eye_block(
+        *(measured, own.pop("system"), measure, printed, sources), is_own=is_own, **own
+    )
 
 
 # Table 3
@@ -130,21 +185,19 @@ def networks(measured: Measured) -> Section:
 # Tables 4 and 5
 
 
-def _in_networks(
-    step: str, method: str | None, column: str, scale: float = 1.0
-) -> From:
+def _in_networks(step: str, method: str | None, column: str, unit: str = "") -> dict:
     where = {"step": step, "method": method, "error_name": ERROR_NAMES}
-    return From("networks", column, where, scale)
+    return {"file": "networks", "column": column, "scale": unit, **where}
 
 
 def _steps(measured: Measured, step: str, column: str) -> list[Block]:
     is_time = column == "median_ms"
     measure = Measure("mean abs. error", "mm" if step == "focus" else "µm")
     blocks = []
-    scale = 1e-3 if is_time else 1.0
+    unit = "s" if is_time else ""
     for way in words()["ways"][step]:
-        ours = _in_networks(step, way["ours"], column, scale)
-        rebuilt = _in_networks(step, way.get("rebuilt"), column, scale)
+        ours = _in_networks(step, way["ours"], column, unit)
+        rebuilt = _in_networks(step, way.get("rebuilt"), column, unit)
         if is_time and step == "eye":
             rebuilt = None  # the time of a search that was cut off says nothing
         block = eye_block(
@@ -183,181 +236,6 @@ def errors(measured: Measured) -> Section:
         blocks += [target, *_steps(measured, step, "error")]
     zeros = published()["tables"]["5"]["note"]
     return section("Table 5", ("networks",), blocks, zeros=zeros)
-
-
-# Tables 6 to 10
-
-
-def layouts(measured: Measured) -> Section:
-    """Table 6: layers and memory of a frame's PSFs, and the time to make them."""
-    kernels = in_layers(
-        *("setting", "frame kernels", "on-axis"),
-        read=lambda setting: setting.split(": ")[1].split(";")[0],
-    )
-    atlas = in_layers("memory_mb", "frame kernels", "on-axis", scale=MIB)
-    making = in_layers("median_ms", "frame kernels", "on-axis")
-    apart = "the paper's texture is dimensioned for all its pupils and foci"
-    blocks = []
-    for which, method in (("previous", "predecessor"), ("proposed", "paper on-axis")):
-        system, rebuilt = SYSTEMS[method], {"method": method}
-        count = From("paper_layouts", "n", rebuilt)
-        memory = From("paper_layouts", "memory_mb", rebuilt, MIB)
-        blocks += [
-            eye_block(
-                *(measured, system, measure, table(6)[column][which], sources),
-                is_own=which == "proposed",
-                rebuilt_as="the layout, for 5 mm and 0.5 dpt",
-                **more,
-            )
-            for column, measure, sources, more in (
-                ("layers", LAYERS, (kernels, count), {"is_contest": False}),
-                ("memory_mib", MIBS, (atlas, memory, atlas), {"incomparable": apart}),
-                ("interpolation_ms", MILLISECONDS, (making,), {"scene": MAKING}),
-            )
-        ]
-    return section("Table 6", ("layers", "paper_layouts"), blocks)
-
-
-def _on_axis(measured: Measured, number: int, measure, column, sizes, as_what):
-    large, small = sizes
-    blocks = [
-        eye_block(
-            *(measured, SYSTEMS[method], measure, own[scene]),
-            (
-                in_field(column, "ours on-axis", scene, large),
-                in_field(column, method, scene, small),
-                in_field(column, "ours on-axis", scene, small),
-            ),
-            is_own=method == "paper on-axis",
-            scene=SCENE_TITLES[scene],
-            rebuilt_as=as_what,
-        )
-        for scene in SCENES
-        for method, own in table(number).items()
-    ]
-    return section(f"Table {number}", ("field",), blocks)
-
-
-def times_on_axis(measured: Measured) -> Section:
-    """Table 7: times of frames."""
-    how = ("median_ms", (LARGE, LARGE), "by FFT, two cores")
-    return _on_axis(measured, 7, MILLISECONDS, *how)
-
-
-def errors_on_axis(measured: Measured) -> Section:
-    """Table 8: their errors."""
-    how = ("psnr_srgb8_db", (LARGE, SMALL), "640x360, our scenes")
-    return _on_axis(measured, 8, DECIBELS, *how)
-
-
-def field_textures(measured: Measured) -> Section:
-    """Table 9: memory and times of PSFs over the visual field."""
-
-    def memory(method: str, size: str) -> From:
-        return in_field("memory_mb", method, "courtyard", size, scale=GIB)
-
-    one_state = (
-        memory("ours quality", LARGE),
-        memory("paper quality", SMALL),
-        memory("ours quality", SMALL),
-    )
-    all_states = (
-        in_layers("memory_mb", "cache", "dynamic", scale=GIB),
-        memory("paper dynamic", SMALL),
-        memory("ours dynamic", SMALL),
-    )
-    texture = (in_layers("memory_mb", "frame kernels", "dynamic", scale=MIB),)
-    making = (in_layers("median_ms", "frame kernels", "dynamic"),)
-    scenes = (
-        *("texture of one pupil and focus", "cache for all pupils and foci"),
-        *("texture of a frame", "making the texture of a frame"),
-    )
-    blocks = [
-        eye_block(
-            *(measured, SYSTEMS[mode], measure, table(9)[mode][column], sources),
-            is_own=True,
-            scene=scene,
-            rebuilt_as=SMALL,
-        )
-        for mode, column, measure, scene, sources in (
-            ("quality", "memory_gib", GIBS, scenes[0], one_state),
-            ("dynamic", "cache_gib", GIBS, scenes[1], all_states),
-            ("dynamic", "texture_mib", MIBS, scenes[2], texture),
-            ("dynamic", "interpolation_ms", MILLISECONDS, scenes[3], making),
-        )
-    ]
-    return section("Table 9", ("layers", "field"), blocks)
-
-
-CELL_MEASURES = {"h": Measure("time", "h"), "ms": MILLISECONDS, "dB": DECIBELS}
-OURS_OFF_AXIS = {"quality": "ours quality", "dynamic": "ours dynamic"}
-REBUILT = {"quality": "paper quality", "dynamic": "paper dynamic"}
-GPU_CASES = {eye: eye for eye in ("emmetropia", "keratoconus")} | {"myopia": "-6 dpt"}
-UNCLEAR = "our copy of the table does not say which method this is of"
-OTHER_CARD = (
-    "that card has five times the arithmetic and six times the bandwidth of the TITAN "
-    "Xp"
-)
-
-
-def _numbers(cells: Mapping[str, str]) -> dict[str, float]:
-    return {eye: float(cell.split()[0]) for eye, cell in cells.items()}
-
-
-def _off_axis_block(measured: Measured, scene: str, method: str) -> Block:
-    cells = table(10)[scene][method]
-    (unit,) = {cell.split()[1] for cell in cells.values()}
-    ours = OURS_OFF_AXIS.get(method, "ours quality")
-    column, scale, rebuilt = "median_ms", HOUR if unit == "h" else 1.0, method
-    if unit == "dB":
-        column, rebuilt = "psnr_srgb8_db", REBUILT.get(method, method)
-    small = in_field(column, ours, scene, SMALL, scale=scale)
-    large = in_field(
-        *(column, ours, scene, LARGE),
-        scale=scale,
-        otherwise=small if unit == "dB" else None,
-    )
-    unclear = unit == "dB" and method in ("quality", "Gonzalez")
-    return eye_block(
-        *(measured, SYSTEMS[method], CELL_MEASURES[unit], _numbers(cells)),
-        (large, in_field(column, rebuilt, scene, SMALL, scale=scale), small),
-        is_own=method in OURS_OFF_AXIS,
-        scene=SCENE_TITLES[scene],
-        incomparable=UNCLEAR if unclear else "",
-        rebuilt_as=SMALL,
-    )
-
-
-def off_axis(measured: Measured) -> Section:
-    """Table 10: times and errors over the visual field."""
-    blocks = [
-        _off_axis_block(measured, scene, method)
-        for scene in SCENES
-        for method in table(10)[scene]
-        if (scene, method) != ("Primitives", "quality")  # times, of which we have none
-    ]
-    own = _numbers(table(10)["Primitives"]["quality"])
-    walk = {"method": "frame", "setting": f"{LARGE} 2 cores"}
-    moving = {"method": "frame", "setting": f"{LARGE} moving"}
-    quality = in_field("median_ms", "ours quality", "courtyard", LARGE)
-    dynamic, on_gpu = (
-        From("live", "median_ms", walk),
-        From("gpu", "median_ms", moving, cases=GPU_CASES),
-    )
-    for mode, ours, eyes, why in (
-        ("ocufilter's quality", quality, EYES, ""),
-        ("ocufilter's dynamic mode", dynamic, EYES, ""),
-        ("ocufilter's dynamic mode on an NVIDIA H100", on_gpu, GPU_CASES, OTHER_CARD),
-    ):
-        block = eye_block(
-            *(measured, f"{SYSTEMS['quality']}, {mode}", MILLISECONDS),
-            *({eye: own[eye] for eye in EYES if eye in eyes}, (ours,)),
-            is_own=True,
-            scene="Primitives (ours: Courtyard)",
-            incomparable=why,
-        )
-        blocks.append(block)
-    return section("Table 10", ("field", "live", "gpu"), blocks)
 
 
 # Table 11
@@ -410,15 +288,14 @@ def first_figure(measured: Measured) -> Section:
     estimation, rendering = [], []
     for k, (case, (step, method)) in enumerate(SIDES.items()):
         steps = [
-            _in_networks(name, "exact", "median_ms", 1e-3).value(measured, "myopia")
+            value(measured, _in_networks(name, "exact", "median_ms", "s"), "myopia")
             for name in ("eye", "focus", step)
         ]
         ours_s = None if None in steps else sum(steps)
         estimation.append(Line(case, own["estimation_s"][k], ours_s))
-        frame = in_field("median_ms", method, "courtyard", LARGE)
-        rendering.append(
-            Line(case, own["rendering_ms"][k], frame.value(measured, "myopia"))
-        )
+        frame = {"case": "myopia", "scene": "courtyard", "size": LARGE}
+        ours_ms = measured.value("field", "median_ms", method=method, **frame)
+        rendering.append(Line(case, own["rendering_ms"][k], ours_ms))
     blocks = [
         Block("The paper", measure, tuple(lines), is_own=True, scene=scene)
         for measure, lines, scene in (
@@ -505,38 +382,14 @@ def psf_section(measured: Measured) -> Section:
     return section("Section 7.2", ("field", "layers"), blocks)
 
 
-def pipeline_section(measured: Measured) -> Section:
-    """Section 4: the published pipeline, which one setting runs, and the default."""
-    blocks = [
-        eye_block(
-            *(measured, "The paper, end to end", measure, None),
-            (
-                None,
-                From("published", column, {"method": "published"}),
-                From("published", column, {"method": "exact"}),
-            ),
-            is_own=True,
-            rebuilt_as='pipeline="published", 128x72, two cores',
-        )
-        for column, measure in (
-            ("error", DECIBELS),
-            ("prepare_ms", Measure("time to the first frame", "ms")),
-            ("median_ms", Measure("time of a frame", "ms")),
-        )
-    ]
-    return section("Section 4", ("published",), blocks)
-
-
 def all_sections(measured: Measured) -> list[Section]:
     """Return every figure and table, by number, and numbers of the text."""
     return [
         first_figure(measured),
         *(picture_section(measured, number) for number in (9, 10, 11, 12)),
-        *(
-            make(measured)
-            for make in (
-                *(networks, times, errors, layouts, times_on_axis, errors_on_axis),
-                *(field_textures, off_axis, statistics, pipeline_section, psf_section),
-            )
-        ),
+        *(make(measured) for make in (networks, times, errors)),
+        *(listed_section(measured, f"Table {number}") for number in range(6, 11)),
+        statistics(measured),
+        listed_section(measured, "Section 4"),
+        psf_section(measured),
     ]
