@@ -3,9 +3,11 @@
 import moderngl
 import pytest
 
+from tests.benchmarks.bench_gpu import forecast_rows
 from tests.benchmarks.gpu_cases import STATE, TextureCase, open_case
 from tests.benchmarks.pass_work import (
     RATES,
+    FrameWork,
     PassWork,
     rates_of,
     searched_blocks,
@@ -52,6 +54,23 @@ def test_the_longest_bound_counts():
     assert PassWork(bytes=4.8e9, flops=1e9).bound_ms(rates) == pytest.approx(1.0)
     assert PassWork(bytes=4.8e9, atomics=3.96e6).bound_ms(rates) == pytest.approx(2.0)
     assert rates_of("llvmpipe") is None
+
+
+def test_an_eye_is_forecast_from_the_other_eyes():
+    work = FrameWork(*range(1, 14))
+    works = {("a", "view"): work, ("b", "view"): work.times(3.0)}
+    slower = {"a": 4.0, "b": 5.0}  # than the bound of a pass
+    rows = [
+        {
+            "case": eye,
+            "setting": "view frozen",
+            "method": "    splat",
+            "median_ms": slower[eye] * own.passes()["splat"].bound_ms(RATES["H200"]),
+        }
+        for (eye, _), own in works.items()
+    ]
+    errors = {row.case: row.error for row in forecast_rows(works, {"rows": rows})}
+    assert errors == pytest.approx({"a": 5.0 / 4.0 - 1.0, "b": 4.0 / 5.0 - 1.0})
 
 
 def test_frames_of_textures_are_timed(case):
