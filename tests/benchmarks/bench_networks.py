@@ -17,7 +17,6 @@ median, 95th percentile and largest error of the 25 terms without piston and til
 """
 
 import sys
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -120,15 +119,8 @@ def answer(
     chosen = nodes[inside]
     if not inside.any():
         return Answer(method, setting, inside)
-    if repeats > 1:
-        values = evaluate(chosen)
-        times_ms = time_calls(lambda: evaluate(chosen), repeats=repeats)
-    else:  # what takes seconds runs once, after a node that compiles it
-        evaluate(chosen[:1])
-        start_s = time.perf_counter()
-        values = evaluate(chosen)
-        times_ms = (1e3 * (time.perf_counter() - start_s),) * 2
-    return Answer(method, setting, inside, repeats, times_ms, values)
+    times_ms = time_calls(lambda: evaluate(chosen), repeats=repeats)
+    return Answer(method, setting, inside, repeats, times_ms, evaluate(chosen))
 
 
 def network_answer(step, nodes, evaluate, *, repeats: int, usable=True) -> Answer:

@@ -20,7 +20,6 @@ from tests.benchmarks.paper_page.rows import (
     Line,
     Section,
     counts,
-    counts_there,
 )
 
 STYLE = Path(__file__).parent / "page.css"
@@ -115,11 +114,11 @@ def _header(sections: Sequence[Section], measured: Measured) -> str:
         ("earlier methods, as the paper reports them", counts(sections, own=False)),
         (
             "the paper's own method, rebuilt, same conditions",
-            counts_there(tables, own=True),
+            counts(tables, own=True, there=True),
         ),
         (
             "earlier methods, rebuilt, same conditions",
-            counts_there(tables, own=False),
+            counts(tables, own=False, there=True),
         ),
     )
     cells = "".join(
@@ -166,12 +165,14 @@ def summary_line(sections: Sequence[Section]) -> str:
 def _contents(sections: Sequence[Section]) -> str:
     rows = []
     for section in sections:
-        found = counts([section], own=True) + counts([section], own=False)
-        there = counts_there([section], own=True) + counts_there([section], own=False)
+        tallies = "".join(
+            f"<td>{_tally(sum((b.counts(there=t) for b in section.blocks), Counter()))}"
+            "</td>"
+            for t in (False, True)
+        )
         rows.append(
             f"<tr><td><a href='#{section.anchor}'>{section.number}</a></td>"
-            f"<td>{escape(section.title)}</td>"
-            f"<td>{_tally(found)}</td><td>{_tally(there)}</td></tr>"
+            f"<td>{escape(section.title)}</td>{tallies}</tr>"
         )
     return (
         "<nav><h2>Contents</h2><table class=contents><thead><tr><th></th><th></th>"
@@ -315,20 +316,15 @@ def _by_system(section: Section, *, title: str) -> str:
     for block in section.blocks:
         unit, lines = block.measure.unit, block.lines
         there = [n for n in lines if n.rebuilt is not None]
-        beside = Counter(block.verdict(n) for n in lines if n.published is not None)
-        beside_there = Counter(
-            block.verdict_there(n) for n in there if n.ours_there is not None
-        )
-        is_same = block.is_contest and block.rebuilt_is_same
         cells = _row(
             _heads(section),
             (
                 _median_text([n.published for n in lines], unit),
                 _median_text([n.ours for n in lines], unit),
-                _tally_cell(beside if block.is_contest else Counter()),
+                _tally_cell(block.counts()),
                 _median_text([n.rebuilt for n in lines], unit),
                 _median_text([n.ours_there for n in there], unit),
-                _tally_cell(beside_there if is_same else Counter()),
+                _tally_cell(block.counts(there=True)),
             ),
         )
         own = " class=own" if block.is_own else ""

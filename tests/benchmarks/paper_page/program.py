@@ -19,7 +19,7 @@ from tests.benchmarks.harness import OUT, ROOT
 from tests.benchmarks.paper_page.content import all_sections
 from tests.benchmarks.paper_page.measured import Measured, ResultMissing
 from tests.benchmarks.paper_page.page import page, summary_line, without_pictures
-from tests.benchmarks.paper_page.rows import VERDICTS, counts, counts_there
+from tests.benchmarks.paper_page.rows import VERDICTS, counts
 
 FRESH = OUT / "paper"
 TAIL_CHARACTERS = 300
@@ -120,22 +120,14 @@ def main() -> int:
 
 
 def _said(path: Path, sections) -> dict:
-    tables = without_pictures(sections)
-
-    def numbers(found) -> dict[str, int]:
-        return {verdict: found[verdict] for verdict in VERDICTS}
-
-    return {
-        "page": str(path),
-        "published": {
-            "own": numbers(counts(sections, own=True)),
-            "earlier": numbers(counts(sections, own=False)),
-        },
-        "rebuilt": {
-            "own": numbers(counts_there(tables, own=True)),
-            "earlier": numbers(counts_there(tables, own=False)),
-        },
-    }
+    said: dict = {"page": str(path)}
+    for name, there in (("published", False), ("rebuilt", True)):
+        judged = without_pictures(sections) if there else sections
+        for whose, own in (("own", True), ("earlier", False)):
+            found = counts(judged, own=own, there=there)
+            numbers = {verdict: found[verdict] for verdict in VERDICTS}
+            said.setdefault(name, {})[whose] = numbers
+    return said
 
 
 if __name__ == "__main__":

@@ -109,6 +109,19 @@ class Block:
             return APART
         return self.measure.compare(_number(line.ours_there), _number(line.rebuilt))
 
+    def counts(self, *, there: bool = False) -> Counter:
+        """Count verdicts beside published figures, or beside systems built anew."""
+        if not self.is_contest or (there and not self.rebuilt_is_same):
+            return Counter()
+        if not there:
+            found = [self.verdict(n) for n in self.lines if n.published is not None]
+            return Counter(found)
+        return Counter(
+            self.verdict_there(line)
+            for line in self.lines
+            if line.rebuilt is not None and line.ours_there is not None
+        )
+
 
 @dataclass(frozen=True)
 class Section:
@@ -151,25 +164,8 @@ def _number(value: float | str | None) -> float | None:
     return None if isinstance(value, str) else value
 
 
-def counts(sections: Iterable[Section], *, own: bool) -> Counter:
-    """Count verdicts beside published figures: of the paper's method, or of others'."""
-    return Counter(
-        block.verdict(line)
-        for section in sections
-        for block in section.blocks
-        if block.is_contest and block.is_own == own
-        for line in block.lines
-        if line.published is not None
-    )
-
-
-def counts_there(sections: Iterable[Section], *, own: bool) -> Counter:
-    """Count verdicts beside systems built anew, where both were measured."""
-    return Counter(
-        block.verdict_there(line)
-        for section in sections
-        for block in section.blocks
-        if block.is_contest and block.rebuilt_is_same and block.is_own == own
-        for line in block.lines
-        if _number(line.rebuilt) is not None and line.ours_there is not None
-    )
+def counts(sections: Iterable[Section], *, own: bool, there: bool = False) -> Counter:
+    """Count verdicts of the paper's method, or of others', as `Block.counts`."""
+    blocks = (block for section in sections for block in section.blocks)
+    found = (block.counts(there=there) for block in blocks if block.is_own == own)
+    return sum(found, Counter())
