@@ -109,12 +109,12 @@ def cases(*, is_quick: bool):
 class Judge:
     """Images and acuity of an eye through a lens, in a first scene."""
 
-    def __init__(self, builder, profile, scene: LensScene, settings):
+    def __init__(self, builder, profile, scene: LensScene, target, settings):
         self._builder, self._profile, self._scene = builder, profile, scene
         pupil_mm = (scene.pupil_diameter_mm,) * 2
         self._sights = {m: Sight(scene, m) for m in ("retina", "luminance")}
         for sight in self._sights.values():
-            sight.target = np.asarray(scene.view.color, np.float32)
+            sight.target = target
         objects_dpt = self._sights["retina"].objects_dpt
         self._settings = {
             "pupil_range_mm": pupil_mm,
@@ -122,11 +122,6 @@ class Judge:
             "object_range_dpt": objects_dpt,
             **settings,
         }
-
-    def set_target(self, target):
-        """Set the target, linear light."""
-        for sight in self._sights.values():
-            sight.target = target
 
     def errors_db(self, lens: Prescription) -> dict[str, float]:
         """Errors of the relaxed eye through spectacles, by the two measures."""
@@ -178,8 +173,7 @@ class Judge:
 def compared(builder, name, pupil_mm, setting, scenes, lens, settings):
     """Yield rows of both lenses, with details."""
     found = best_lens(EYES[name], scenes, lens=lens, settings=settings, builder=builder)
-    judge = Judge(builder, EYES[name], scenes[0], settings)
-    judge.set_target(found.target)
+    judge = Judge(builder, EYES[name], scenes[0], found.target, settings)
     milliseconds = 1e3 * found.search_s
     for method, trial in (("visual Strehl", found.start), ("scene", found.best)):
         text = format_prescription(trial.prescription)

@@ -332,14 +332,15 @@ def picture_section(measured: Measured, number: int) -> Section:
         if name != ours
     ]
     content = measured.results("paper_figures")
+    frames = content.get("frames", [content])[0]
     return section(
         *(f"Figure {number}", ("paper_figures",), blocks),
         entry="pictures",
         picture=f"paper_figure_{number}.jpg",
         field="over the visual field" if number in (11, 12) else "on the axis",
         eyes="with mixed aberrations" if number in (10, 12) else "of low order only",
-        size=content["size"],
-        state=content["state"],
+        size=frames["size"],
+        state=frames["state"],
     )
 
 

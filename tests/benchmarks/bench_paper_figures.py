@@ -1,17 +1,14 @@
 """Our pictures for the paper's figures 1 and 9 to 12, rendered and kept.
 
-    python -m tests.benchmarks.paper_page.pictures [--quick] [--out DIR]
-
 Every figure is one JPEG: a row for each eye and scene, with our whole picture and then
 one part of it by every method that the paper's figure compares, each with its error
-there.  The reference has the exact PSF of every pixel.  A whole run takes some
-six minutes of two cores and writes tests/benchmarks/results/paper_figure_N.jpg with
-paper_figures.json, which holds the errors, the machine and the commit.
+there.  The reference has the exact PSF of every pixel.  A whole run writes
+tests/benchmarks/results/paper_figure_N.jpg, a quick one out/paper/paper_figure_N.jpg.
+A row's time is that of all methods and of the reference.
 """
 
-import argparse
-import json
-import sys
+import time
+from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
@@ -20,16 +17,16 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from filter_service.progress import Progress
 from filter_service.rendering.media_effects import srgb_from_linear
 from tests.benchmarks.dense_reference import dense_reference
 from tests.benchmarks.engines import open_renderer
 from tests.benchmarks.field_methods import METHODS, EyeBench, State
-from tests.benchmarks.harness import RESULTS, commit_id, machine_info
+from tests.benchmarks.harness import OUT, RESULTS, Row, Run, memory_mb
 from tests.benchmarks.image_measures import channel_psnr_db
 from tests.benchmarks.view_sources import Window
 from tests.numerical.scene_frames import scene_view
 
+MINUTES = 12
 SIZE, QUICK_SIZE = (640, 360), (320, 180)
 STATE = State(5.0, 0.5)
 CELL_PX = (240, 135)
@@ -73,6 +70,16 @@ FIGURES = {
     12: (MIXED, False),
 }
 BY_NAME = {method.name: method for method in METHODS}
+
+
+@dataclass(frozen=True)
+class FigureRow(Row):
+    """Errors of an eye and scene by method; ``error`` is ours."""
+
+    figure: int
+    eye: str
+    scene: str
+    psnr_db: dict[str, float]
 
 
 @dataclass(frozen=True)
@@ -158,34 +165,24 @@ def _framed(color: NDArray, window: Window) -> NDArray:
     return framed
 
 
-def render(out: Path, *, quick: bool, progress: Progress) -> dict:
-    """Render every figure into a folder; errors of each, and where they are from."""
-    size = QUICK_SIZE if quick else SIZE
-    task = progress.task("Rendering figures", total=1 + len(FIGURES), unit="figures")
-    renderer = open_renderer()
-    out.mkdir(parents=True, exist_ok=True)
-    _save(sheet(first_figure(renderer, size), (640, 360)), out, 1)
-    task.advance()
-    errors = []
-    for number, (eyes, on_axis) in FIGURES.items():
-        rows = []
-        for eye, scene in product(eyes[:1] if quick else eyes, SCENE_TITLES):
-            cells, errors_db = row_cells(renderer, eye, scene, size, on_axis=on_axis)
-            rows.append(cells)
-            place = {"figure": number, "eye": eye, "scene": scene}
-            errors.append({**place, "psnr_db": errors_db})
-        _save(sheet(rows, CELL_PX), out, number)
-        task.advance()
-    content = {
-        "machine": {**machine_info(), "renderer": renderer.name},
-        "commit": commit_id(),
-        "size": "{}x{}".format(*size),
-        "state": str(STATE),
-        "rows": errors,
-    }
-    text = json.dumps(content, indent=1) + "\n"
-    (out / "paper_figures.json").write_text(text, encoding="utf-8")
-    return content
+def figure_rows(
+    number: int, renderer, size: tuple[int, int], out: Path, *, is_quick: bool
+) -> Iterator[FigureRow]:
+    """Yield the rows of a figure, and write its picture."""
+    eyes, on_axis = FIGURES[number]
+    rows = []
+    for eye, scene in product(eyes[:1] if is_quick else eyes, SCENE_TITLES):
+        start_s = time.perf_counter()
+        cells, errors_db = row_cells(renderer, eye, scene, size, on_axis=on_axis)
+        time_ms = 1e3 * (time.perf_counter() - start_s)
+        rows.append(cells)
+        ours_db = errors_db["ours on-axis" if on_axis else "ours quality"]
+        yield FigureRow(
+            *("paper_figures", f"figure {number}", eye, f"{scene} {size[0]}x{size[1]}"),
+            *(1, time_ms, time_ms, memory_mb(), "psnr_db", ours_db),
+            *("exact PSF of every pixel", number, eye, scene, errors_db),
+        )
+    _save(sheet(rows, CELL_PX), out, number)
 
 
 def _save(page: Image.Image, out: Path, number: int) -> None:
@@ -193,16 +190,16 @@ def _save(page: Image.Image, out: Path, number: int) -> None:
     page.save(path, quality=JPEG_QUALITY, optimize=True)
 
 
-def main() -> int:
-    """Run the program; its exit code."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--quick", action="store_true", help="320x180, one eye each")
-    parser.add_argument("--out", type=Path, default=RESULTS, metavar="DIR")
-    arguments = parser.parse_args()
-    with Progress() as progress:
-        render(arguments.out, quick=arguments.quick, progress=progress)
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+def measure(run: Run) -> tuple[list[Row], dict[str, list[dict]]]:
+    """Return rows, and the size and state of the frames; write the pictures."""
+    size = QUICK_SIZE if run.is_quick else SIZE
+    out = OUT / "paper" if run.is_quick else RESULTS
+    out.mkdir(parents=True, exist_ok=True)
+    renderer = open_renderer()
+    _save(sheet(first_figure(renderer, size), (640, 360)), out, 1)
+    rows: list[Row] = [
+        row
+        for number in FIGURES
+        for row in figure_rows(number, renderer, size, out, is_quick=run.is_quick)
+    ]
+    return rows, {"frames": [{"size": "{}x{}".format(*size), "state": str(STATE)}]}
