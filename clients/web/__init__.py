@@ -10,6 +10,7 @@ controls       the numbers that can be entered, with limits, steps, initial valu
 written        those numbers as people write them
 comparison     states A and B of one person: names, differences, a joined picture
 eye_form       entries of an eye and its correction, and the resulting profile
+correction_hints  what a correction does, and its additions in spectacles
 eye_panel      those entries on the page
 eyes_card      which eyes and states are shown, with the panels of their entries
 scenario_menu  scenarios, each with its scene, conditions, and states A and B

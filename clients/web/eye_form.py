@@ -37,6 +37,7 @@ from estimator import (
     MAX_PROFILE_BYTES,
     PROFILE_SUFFIXES,
     InvalidFile,
+    ProfileError,
     load_profile,
     parse_profile,
     preset_names,
@@ -68,9 +69,17 @@ KINDS: dict[WornKind, str] = {
     "iol": "Intraocular lens",
     "laser": "Laser surgery",
 }
+NO_SURGERY = (
+    "Surgery cannot be computed for this file, because it describes the eye by its "
+    "surfaces. Choose spectacles or a contact lens, or describe the eye before surgery "
+    "by its prescription, a preset or a measured wavefront."
+)
 AS_IN_FILE = "As in the file"
 SURGERIES: tuple[WornKind, ...] = ("iol", "laser")
 """Kinds that change the eye of the entries above them."""
+
+SURGERY_FIELDS = ("correction.residual_sphere_dpt", "correction.kind")
+"""Fields of the error if a kind of profile allows no surgery."""
 
 Haze = Literal[
     "none", "age", "nuclear", "cortical", "posterior_subcapsular", "measured"
@@ -100,22 +109,6 @@ DESIGNS = {
     "trifocal": "Trifocal",
     "edof": "Extended depth of focus",
 }
-HINTS: dict[WornKind, str] = {
-    "progressive": "“Look: Reading” turns the gaze to the end of the corridor; use the "
-    "gaze sliders to look through other parts of the lens.",
-    "lenslets": "396 lenslets around a clear center; use the gaze sliders to look "
-    "through other parts.",
-    "contact_lens": "Spherical aberration is what the lens adds: C(4,0) through 6 mm.",
-    "iol": "Replaces the natural lens of the eye above, whose length and cornea stay. "
-    "Its power is chosen such that the residual refraction remains: 0 is sharp far "
-    "away. Accommodation, and haze and yellowing of the natural lens, are gone. "
-    "Additions apply at the lens. Spherical aberration is what the lens adds to the "
-    "cornea: C(4,0) through 6 mm.",
-    "laser": "Reshapes the cornea of the eye above, such that the residual refraction "
-    "remains. Everything else in the eye stays. Spherical aberration is what the "
-    "surgery adds: C(4,0) through 6 mm.",
-}
-
 FIELDS_BY_KIND: dict[WornKind, tuple[NumberField, ...]] = {
     "spectacles": PRESCRIPTION,
     "progressive": (*PRESCRIPTION, PROGRESSIVE_ADD, CORRIDOR),
@@ -389,7 +382,13 @@ class EyeForm:
             body["correction"] = self.worn.body()
             if not self.applies_higher_order:
                 body.pop("higher_order", None)
-        parse_profile(body)
+        try:
+            parse_profile(body)
+        except ProfileError as error:
+            is_surgery = self.wears_correction and self.worn.kind in SURGERIES
+            if is_surgery and error.field in SURGERY_FIELDS:
+                raise ValueError(NO_SURGERY) from None
+            raise
         return body
 
     def _media(self) -> dict[str, Any]:

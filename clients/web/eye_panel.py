@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Awaitable, Callable, Collection
+from collections.abc import Awaitable, Callable, Collection, Iterable
 from functools import partial
 from typing import Any
 
@@ -14,24 +14,33 @@ from clients.web.controls import (
     AXIS,
     CYLINDER,
     PRESCRIPTION,
+    RESIDUAL,
     SPHERE,
     SPHERE_SLIDER,
     STRAYLIGHT,
     NumberField,
     prescription_texts,
 )
+from clients.web.correction_hints import HELP, additions_text, correction_hint
 from clients.web.eye_form import (
     CATARACT,
     DESIGNS,
     DISTANCE_KINDS,
     HAZES,
-    HINTS,
     SIDES,
     YELLOWINGS,
     EyeForm,
     preset_titles,
 )
-from clients.web.widgets import SliderRow, select, switch, title, toggle, upload_entry
+from clients.web.widgets import (
+    SliderRow,
+    help_button,
+    select,
+    switch,
+    title,
+    toggle,
+    upload_entry,
+)
 from estimator import MAX_PROFILE_BYTES, PROFILE_SUFFIXES
 
 SOURCES = {"prescription": "Prescription", "preset": "Preset", "file": "File"}
@@ -39,6 +48,11 @@ SOURCES = {"prescription": "Prescription", "preset": "Preset", "file": "File"}
 NO_HIGHER_ORDER = (
     "Without aberrations of the age: the prescription is that after lens surgery."
 )
+
+RESIDUAL_PREFIX = "Residual "
+"""Start of labels that the heading of their group says."""
+
+REMAINS = "Remains after surgery, through a 4 mm pupil:"
 
 CATARACT_AGE_YEARS = 50.0
 YOUNG_CATARACT = (
@@ -77,6 +91,7 @@ class EyePanel:
         self._entries: dict[tuple[str, bool], ui.input] = {}
         self._choices: dict[str, ui.element] = {}  # by profile field
         self._marked: Collection[str] = ()
+        self._additions: ui.label | None = None
         with ui.element("div").classes("oc-eye-box") as self.box:
             self.heading = title(SIDES[form.side], "h3", "oc-eye-title")
             with ui.element("div").classes("oc-eye") as entries:
@@ -181,7 +196,7 @@ class EyePanel:
             is_pasted = True
 
         entry = ui.input(
-            number.label,
+            number.label.removeprefix(RESIDUAL_PREFIX).capitalize(),
             value=texts[number.name],
             validation=lambda text: number.problem(text or ""),
             on_change=store,
@@ -226,7 +241,10 @@ class EyePanel:
                     self._takes(partial(setattr, form, name)),
                     label=label,
                 )
-                self._choices[field] = entry.classes("oc-half").mark(name)
+                # the longest name would be cut
+                is_long = getattr(form, name) == "posterior_subcapsular"
+                width = "oc-whole" if is_long else "oc-half"
+                self._choices[field] = entry.classes(width).mark(name)
             if form.haze == "measured":
                 self._entry(STRAYLIGHT, form.media_texts)
         self._haze = ui.label("").classes("oc-hint oc-haze")
@@ -255,9 +273,12 @@ class EyePanel:
                 ).tooltip("Wear the prescription above; keep kind of lens and addition")
         if not form.wears_correction:
             return
-        self._choices["correction.kind"] = select(
-            worn.kinds, worn.kind, self._takes(form.choose_worn), label="Correction"
-        ).classes("oc-wide oc-worn-kind")
+        with ui.element("div").classes("oc-line"):
+            self._choices["correction.kind"] = select(
+                worn.kinds, worn.kind, self._takes(form.choose_worn), label="Correction"
+            ).classes("oc-grow oc-worn-kind")
+            if worn.kind in HELP:
+                help_button("surgery", HELP[worn.kind])
         if worn.kind == "iol":
             self._choices["correction.design"] = select(
                 DESIGNS,
@@ -265,12 +286,28 @@ class EyePanel:
                 self._takes(partial(setattr, worn, "design")),
                 label="Design",
             ).classes("oc-wide oc-worn-design")
-        with ui.element("div").classes("oc-fields oc-worn"):
-            for number in worn.entries:
-                entry = self._entry(number, worn.texts, is_worn=True)
+        residual = [number for number in worn.entries if number in RESIDUAL]
+        self._worn_entries([n for n in worn.entries if n not in RESIDUAL])
+        self._additions = ui.label("").classes("oc-hint oc-additions")
+        if residual:
+            with ui.element("div").props('role=group aria-label="Residual refraction"'):
+                ui.label(REMAINS).classes("oc-hint")
+                self._worn_entries(residual, kind="oc-three")
+        ui.label(correction_hint(form)).classes("oc-note oc-hint")
+        self.show_additions()
+
+    def _worn_entries(self, numbers: Iterable[NumberField], kind: str = "") -> None:
+        with ui.element("div").classes(f"oc-fields oc-worn {kind}"):
+            for number in numbers:
+                entry = self._entry(number, self.form.worn.texts, is_worn=True)
                 entry.props["data-worn"] = ""
-        if worn.kind in HINTS:
-            ui.label(HINTS[worn.kind]).classes("oc-hint")
+
+    def show_additions(self) -> None:
+        """Say what the additions of an implant would be in spectacles."""
+        if self._additions is not None and self.form.wears_correction:
+            text = additions_text(self.form, age_years=self._age_years())
+            self._additions.text = text
+            self._additions.set_visibility(bool(text))
 
     def _switch(self, label: str, name: str, *, rebuilds: bool = True) -> ui.switch:
         take = self._takes(partial(setattr, self.form, name), rebuilds=rebuilds)

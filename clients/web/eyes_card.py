@@ -185,6 +185,7 @@ class EyesCard:
         paths = {one.path for one in found}
         for name, panel in self._panels.items():
             panel.show_haze()
+            panel.show_additions()
             panel.mark(paths if name in self._state.names else ())
         listed = "; ".join(f"{one.label}: {one.a} → {one.b}" for one in found)
         if not self._state.is_comparing:

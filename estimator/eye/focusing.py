@@ -50,11 +50,14 @@ class Focusing(ABC):
         Largest accommodation.
     vergence : ObjectVergence
         Conversion of distances to vergences through the correction.
+    rings : Rings or None
+        Lens with several foci, or lenslets.
     """
 
     refraction_dpt: float
     amplitude_dpt: float
     vergence: ObjectVergence
+    rings: Rings | None = None
 
     @abstractmethod
     def refraction_at_dpt(
@@ -135,11 +138,14 @@ class Focusing(ABC):
     ) -> tuple[str, ...]:
         """Return notes on a focus distance that this eye cannot reach."""
         far_dpt, near_dpt = self.focus_limits_dpt(pupil_diameter_mm)
+        blurred = "blurred"
+        if self.rings is not None and self.rings.lattice_mm is None:
+            blurred = "blurred in the distance focus of the lens"
         if focus_dpt < far_dpt - OUT_OF_REACH_DPT:
             note = Note(
                 "focus_beyond_far_point",
-                f"blurred: nothing beyond {_distance(far_dpt)} is sharp; focus "
-                f"{focus_dpt:g} dpt is beyond the far point ({far_dpt:.3g} dpt): the "
+                f"{blurred}: nothing beyond {_distance(far_dpt)} is sharp; focus "
+                f"{focus_dpt:.3g} dpt is beyond the far point ({far_dpt:.3g} dpt): the "
                 "eye stays relaxed",
                 focus_dpt=focus_dpt,
                 far_point_dpt=far_dpt,
@@ -166,7 +172,7 @@ class Focusing(ABC):
         )
         note = Note(
             code,
-            f"blurred: {seen}; focus {focus_dpt:g} dpt {reached}: "
+            f"{blurred}: {seen}; focus {focus_dpt:.3g} dpt {reached}: "
             f"accommodation stops at {added_dpt:.3g} dpt",
             focus_dpt=focus_dpt,
             near_point_dpt=near_dpt,

@@ -5,7 +5,13 @@ import re
 import numpy as np
 import pytest
 
-from clients.figures import EyeStudy, draw_cross_section, draw_psfs, draw_wavefront_map
+from clients.figures import (
+    EyeStudy,
+    draw_cross_section,
+    draw_psfs,
+    draw_wavefront_map,
+    wavefront_range_um,
+)
 from clients.figures.style import new_figure
 from clients.report.content import (
     PAIR_MAP_MM,
@@ -152,3 +158,17 @@ def test_no_label_of_the_point_images_is_clipped():
         assert page.x0 <= box.x0
         assert page.y0 <= box.y0
         assert box.y1 <= page.y1
+
+
+def test_maps_of_two_wavefronts_can_share_their_colors():
+    weak_um, strong_um = np.zeros(28), np.zeros(28)
+    weak_um[12], strong_um[12] = 0.1, 0.3
+    range_um = wavefront_range_um(strong_um)
+    # C(4,0) is sqrt(5) (6 r⁴ - 6 r² + 1), largest in the center and at the edge
+    assert range_um == pytest.approx(0.3 * np.sqrt(5.0), rel=1e-3)
+    for zernike_um in (weak_um, strong_um):
+        axes = new_figure(60.0, PAIR_MAP_MM).subplots()
+        draw_wavefront_map(
+            axes, zernike_um, radius_mm=3.0, eye_side="OD", range_um=range_um
+        )
+        assert axes.images[0].get_clim() == (-range_um, range_um)

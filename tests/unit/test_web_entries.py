@@ -16,6 +16,11 @@ from clients.web.controls import (
     distance_text,
     prescription_texts,
 )
+from clients.web.correction_hints import (
+    KEPT_ABERRATIONS,
+    additions_text,
+    correction_hint,
+)
 from clients.web.eye_form import (
     DESIGNS,
     KINDS,
@@ -414,3 +419,32 @@ def test_a_link_that_is_none_is_told(text):
     found = restore(PageState(), base64.urlsafe_b64encode(text).decode())
     assert found.scene is None
     assert "no entries" in found.problems[0]
+
+
+def test_an_addition_at_the_implant_is_told_as_one_in_spectacles():
+    form = EyeForm("OD", wears_correction=True)
+    form.worn.kind, form.worn.design = "iol", "bifocal"
+    form.worn.texts["add_dpt"] = "4"
+    # Gaussian optics of a cornea of 43.04 dpt, a lens 4.6 mm behind it, an entrance
+    # pupil 3.05 mm behind it and spectacles 12 mm before it
+    at_pupil_dpt = 4.0 * (1.0 - 0.0046 / 1.3386 * 43.04) ** 2
+    near_m = 1.0 / at_pupil_dpt
+    worn_dpt = 1.0 / (near_m - 0.01505)
+    text = additions_text(form, age_years=70.0)
+    assert f"spectacles: {worn_dpt:+.2f} dpt, for {100.0 * near_m:.0f} cm" in text
+    form.worn.design = "monofocal"
+    assert additions_text(form, age_years=70.0) == ""
+
+
+@pytest.mark.parametrize("kind", SURGERIES)
+def test_surgery_of_an_eye_of_surfaces_is_refused_in_a_sentence(kind):
+    form = EyeForm("OD", wears_correction=True)
+    form.load_body({"kind": "synteyes", "sample": 3}, "eye.json")
+    form.worn.kind = kind
+    with pytest.raises(
+        ValueError, match=r"^Surgery cannot be computed .* prescription"
+    ):
+        form.body(age_years=70.0)
+    form.worn.kind = "spectacles"
+    assert form.body(age_years=70.0)["kind"] == "synteyes"
+    assert KEPT_ABERRATIONS not in correction_hint(form)
