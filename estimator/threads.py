@@ -6,6 +6,7 @@ import math
 import os
 import sys
 import time
+from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 
@@ -41,8 +42,13 @@ def thread_count() -> int:
     return max(1, min(_core_count(), _quota_cores(_CGROUP)))
 
 
-if hasattr(os, "register_at_fork"):  # a forked child of `multiprocessing` has another
-    os.register_at_fork(after_in_child=thread_count.cache_clear)
+def call_after_fork(function: Callable[[], object]) -> None:
+    """Call a function in each forked process; Windows has no fork."""
+    if hasattr(os, "register_at_fork"):
+        os.register_at_fork(after_in_child=function)
+
+
+call_after_fork(thread_count.cache_clear)  # a child of `multiprocessing` has another
 
 
 def _is_child() -> bool:

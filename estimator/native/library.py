@@ -14,7 +14,7 @@ import numpy as np
 from estimator.native import records
 from estimator.native.functions import FUNCTIONS
 from estimator.native.records import pointer_to
-from estimator.threads import thread_count
+from estimator.threads import call_after_fork, thread_count
 
 PATH = Path(__file__).parent / "_core.so"
 FOLDER_VARIABLE = "OCUFILTER_LIBRARY_DIR"
@@ -260,7 +260,7 @@ def shared_threads() -> int:
     return core().new_threads(thread_count())
 
 
-os.register_at_fork(after_in_child=shared_threads.cache_clear)  # it may use fewer
+call_after_fork(shared_threads.cache_clear)  # it may use fewer
 
 
 @cache

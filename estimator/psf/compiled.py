@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ctypes
-import os
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -20,6 +19,7 @@ from estimator.native.records import (
 )
 from estimator.psf.fourier import ACCURACY, FourierAccuracy
 from estimator.psf.tables import GEOMETRIC_FROM_DB, psf_tables
+from estimator.threads import call_after_fork
 
 SIDES = 4
 
@@ -187,4 +187,4 @@ def compiled_psfs() -> CompiledPsfs:
     return CompiledPsfs(core(), shared_threads())
 
 
-os.register_at_fork(after_in_child=compiled_psfs.cache_clear)
+call_after_fork(compiled_psfs.cache_clear)

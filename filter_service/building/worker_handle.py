@@ -21,7 +21,7 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from estimator.threads import THREADS_VARIABLE
+from estimator.threads import THREADS_VARIABLE, call_after_fork
 from filter_service.building.jobs import (
     BuildDone,
     BuildError,
@@ -144,7 +144,7 @@ class _KeptProcess:
 
 _kept = _KeptProcess()
 atexit.register(_kept.end)
-os.register_at_fork(after_in_child=_kept.abandon)
+call_after_fork(_kept.abandon)
 
 
 @dataclass

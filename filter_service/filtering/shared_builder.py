@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import atexit
 import logging
-import os
 import threading
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -12,6 +11,7 @@ from functools import cache
 from multiprocessing import current_process
 from typing import TYPE_CHECKING, Any
 
+from estimator.threads import call_after_fork
 from filter_service.building.jobs import BuildLimits, default_cache_dir
 from filter_service.building.worker_handle import InlineWorker, WorkerHandle
 from filter_service.constants import ENGINES
@@ -271,7 +271,7 @@ def _reset_after_fork() -> None:
     shared.cache_clear()
 
 
-os.register_at_fork(after_in_child=_reset_after_fork)
+call_after_fork(_reset_after_fork)
 
 
 def preload() -> None:

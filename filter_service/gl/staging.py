@@ -7,7 +7,6 @@ ARB_buffer_storage).
 """
 
 import ctypes
-import os
 from collections import deque
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -19,7 +18,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.threads import thread_count
+from estimator.threads import call_after_fork, thread_count
 from filter_service.errors import OutOfGpuMemory, RenderFailed
 
 if TYPE_CHECKING:
@@ -56,7 +55,7 @@ def _pool() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(MAX_THREADS - 1, thread_name_prefix="copy")
 
 
-os.register_at_fork(after_in_child=_pool.cache_clear)  # threads do not survive a fork
+call_after_fork(_pool.cache_clear)  # threads do not survive a fork
 
 
 GL_TIME_ELAPSED, GL_QUERY_RESULT = 0x88BF, 0x8866

@@ -7,7 +7,6 @@ processor time, because each PSF must be surveyed before it is dispatched.
 
 from __future__ import annotations
 
-import os
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -18,7 +17,7 @@ from numpy.typing import NDArray
 
 from estimator.field.eye_optics import EyeOptics
 from estimator.psf.compute import PsfBatch, compute_psf_batch
-from estimator.threads import thread_count
+from estimator.threads import call_after_fork, thread_count
 from filter_service.constants import RGB
 from filter_service.planning.cost import COMPUTED_BEYOND
 from filter_service.planning.grid import GridSpec
@@ -75,7 +74,7 @@ def psf_engine(pipeline: str = "exact", threads: int | None = None) -> PsfEngine
     return PsfEngine(compute_psf_batch, NATIVE_BATCH, native_psfs(threads))
 
 
-os.register_at_fork(after_in_child=psf_engine.cache_clear)
+call_after_fork(psf_engine.cache_clear)
 
 
 def computed_kernels(

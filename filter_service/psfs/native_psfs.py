@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import os
 from collections import Counter
 from dataclasses import dataclass, replace
 from functools import cache
@@ -19,6 +18,7 @@ from estimator.psf.fourier import ACCURACY
 from estimator.psf.screens import BEYOND_EDGE, ONE_CENTER, TABLE_COUNT
 from estimator.psf.stiles_crawford import StilesCrawford
 from estimator.psf.tables import GEOMETRIC_FROM_DB
+from estimator.threads import call_after_fork
 from filter_service.constants import RGB
 from filter_service.planning.node_wavefronts import NodeWavefronts
 from filter_service.psfs.pack import CUT_STEPS, MAX_CENTROID_SHIFT_RATIO, PackedKernels
@@ -211,4 +211,4 @@ def native_psfs(threads: int | None = None) -> NativePsfs:
     return NativePsfs(engine)
 
 
-os.register_at_fork(after_in_child=native_psfs.cache_clear)
+call_after_fork(native_psfs.cache_clear)

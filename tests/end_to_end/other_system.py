@@ -19,6 +19,7 @@ UNIX_ONLY = {
     os: (
         *("O_NONBLOCK", "O_CLOEXEC", "O_NOFOLLOW", "O_DIRECTORY", "posix_fallocate"),
         *("fork", "nice", "pread", "getuid", "geteuid", "fchmod", "sysconf"),
+        "register_at_fork",
     ),
     socket: ("AF_UNIX", "SCM_RIGHTS", "CMSG_LEN", "CMSG_SPACE"),
     mmap: ("MAP_SHARED", "MAP_PRIVATE", "MAP_ANONYMOUS", "PROT_READ", "PROT_WRITE"),
