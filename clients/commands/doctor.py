@@ -40,8 +40,6 @@ SERVICE_PACKAGES = (
 CLIENT_PACKAGES = ("av",)
 WINDOW_PACKAGES = ("glfw",)
 PYRENDER_PACKAGES = ("pyrender", "trimesh", "PyOpenGL")
-FORMER_PACKAGES = ("imageio", "imageio-ffmpeg")
-"""Packages that are no longer required; version 0.3 removes them from ``packages``."""
 
 SYSTEM_LIBRARIES = {"EGL": "libegl1", "GL": "libgl1"}
 """Libraries that are loaded by name, and Debian packages that contain them."""
@@ -190,7 +188,7 @@ def package_versions() -> dict[str, str | None]:
     """Return the version of each package that ocufilter may use; None if missing."""
     versions: dict[str, str | None] = {}
     names = SERVICE_PACKAGES + CLIENT_PACKAGES + WINDOW_PACKAGES + PYRENDER_PACKAGES
-    for name in names + FORMER_PACKAGES:
+    for name in names:
         try:
             versions[name] = version(name)
         except PackageNotFoundError:
