@@ -1,7 +1,5 @@
 """Images of 31 bands, and cone signals of RGB frames, in time, memory and error.
 
-    python -m tests.benchmarks.bench_bands [--quick] [--json]
-
 The courtyard, shown on a measured display: its light in 31 bands from 400 to
 700 nm is the light of its three primaries.
 
@@ -18,11 +16,8 @@ The courtyard, shown on a measured display: its light in 31 bands from 400 to
   picture that has the same cone signals on a display, before both are filtered.  White
   is the 99th percentile.  Only if the package tensorly, which contains the scene, is
   installed.
-
-Writes results/bands.json.
 """
 
-import argparse
 import importlib
 import resource
 import sys
@@ -40,10 +35,12 @@ from filter_service import BandFilter, Camera, EyeFilter
 from filter_service.displays import primaries_of_spectra
 from filter_service.rendering.media_effects import linear_from_srgb
 from filter_service.rgbd_view import RgbdView
-from tests.benchmarks.harness import Row, memory_mb, publish
+from tests.benchmarks.harness import Row, Run
+from tests.benchmarks.rows import row_of
 from tests.numerical.scene_frames import scene_view
 from tests.reference.display_pictures import measured_displays
 
+MINUTES = 9
 SIZE_PX, QUICK_SIZE_PX = (480, 270), (96, 54)
 COUNT, QUICK_COUNT = 7, 2
 EYES = ("emmetropia", "myopia", "keratoconus")
@@ -136,18 +133,14 @@ def time_rows(view: RgbdView, name: str, count: int) -> list[Row]:
             found_ms = other.submit(rgb_frames_ms, groups).result()
             times_ms["RGB frames"].append(found_ms)
         other.submit(close_rgb).result()
-    ratio = min(times_ms["31 bands"]) / min(times_ms["RGB frames"])
+    least_ms = {method: min(own) for method, own in times_ms.items()}
     setting = f"{view.width_px}x{view.height_px}, {groups} groups"
     found = [
-        Row(
-            *("bands", method, name, setting, count, float(np.median(own))),
-            *(float(np.percentile(own, 95)), memory_mb()),
-            *("minimum, ms", min(own), "none"),
-        )
+        row_of("bands", method, name, setting, own, "minimum, ms", min(own), "none")
         for method, own in times_ms.items()
     ]
     for error_name, value in (
-        ("ratio of minima", ratio),
+        ("ratio of minima", least_ms["31 bands"] / least_ms["RGB frames"]),
         ("first frame, ms", first_ms),
         ("growth of the process, MB", grown_mb),
         ("PSFs, MB", psfs_mb),
@@ -181,17 +174,19 @@ def shortcut_rows(view: RgbdView, name: str) -> list[Row]:
         started_s = time.perf_counter()
         truth = seen_bands(name, view, spectral(view, power), at_nm) @ weights / white
         true_ms = 1e3 * (time.perf_counter() - started_s)
-        row = Row(
-            *("bands", "LMS of RGB", f"{name}, {display}", "", 1, 0.0, true_ms),
-            *(memory_mb(), "", 0.0, "31 bands, exact"),
-        )
-        found += compared(row, view, truth, white)
+        found += compared("LMS of RGB", name, display, view, (truth, white, true_ms))
     return found
 
 
-def compared(row: Row, view: RgbdView, truth: NDArray, white: NDArray) -> list[Row]:
-    """Return rows like one: RGB frames against true signals (height, width, 3)."""
-    name, display = row.case.split(", ", 1)
+def compared(
+    method: str, name: str, display: str, view: RgbdView, exact: tuple
+) -> list[Row]:
+    """Return rows of RGB frames against true signals, over the signals of white.
+
+    ``exact`` are the signals (height, width, 3), those of white (3,), and the time of
+    their frame, which is the row's 95th percentile.
+    """
+    truth, white, true_ms = exact
     at_nm, power = measured_displays()[display]
     wavelengths_nm, _ = primaries_of_spectra(at_nm, power)
     shown = ",".join(f"{nm:.1f}" for nm in wavelengths_nm)
@@ -202,14 +197,17 @@ def compared(row: Row, view: RgbdView, truth: NDArray, white: NDArray) -> list[R
         rgb = eye_filter.filter(view, output="linear", **STATE, **EXACT).color
     ours = rgb @ (power.T @ lms_weights(at_nm)) / white
     own_ms = 1e3 * (time.perf_counter() - started_s)
-    row = replace(row, setting=f"{shown} nm", median_ms=own_ms)
     found = []
     for cone, own in zip("LMS", np.moveaxis(ours - truth, 2, 0), strict=True):
         for error_name, value in (
             (f"{cone}, dB", -10.0 * np.log10(np.mean(own**2))),
             (f"{cone}, largest over white", np.abs(own).max()),
         ):
-            found.append(replace(row, error_name=error_name, error=float(value)))
+            row = row_of(
+                *("bands", method, f"{name}, {display}", f"{shown} nm", [own_ms]),
+                *(error_name, value, "31 bands, exact"),
+            )
+            found.append(replace(row, p95_ms=true_ms))
     return found
 
 
@@ -248,34 +246,23 @@ def scene_rows(name: str) -> list[Row]:
     for display, (display_nm, power) in measured_displays().items():
         from_lms = np.linalg.inv(power.T @ lms_weights(display_nm))
         picture = np.ascontiguousarray(bands @ weights @ from_lms, np.float32)
-        row = Row(
-            *("bands", "LMS of a scene", f"{name}, {display}", "", 1, 0.0, true_ms),
-            *(memory_mb(), "", 0.0, "31 bands, exact"),
+        found += compared(
+            *("LMS of a scene", name, display),
+            *(replace(view, color=picture), (truth, white, true_ms)),
         )
-        found += compared(row, replace(view, color=picture), truth, white)
     return found
 
 
-def main() -> None:
-    """Run from the command line."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--quick", action="store_true", help="96x54, one eye")
-    parser.add_argument("--json", action="store_true", help="print the report alone")
-    options = parser.parse_args()
-    size_px = QUICK_SIZE_PX if options.quick else SIZE_PX
-    count = QUICK_COUNT if options.quick else COUNT
-    view = linear_view(size_px)
+def measure(run: Run) -> list[Row]:
+    """Return the rows of all eyes, or of one at a small size."""
+    size_px, count = (QUICK_SIZE_PX, QUICK_COUNT) if run.is_quick else (SIZE_PX, COUNT)
+    eyes = EYES[:1] if run.is_quick else EYES
+    view, narrow = linear_view(size_px), linear_view(QUICK_SIZE_PX, fov_deg=NARROW_DEG)
     rows: list[Row] = []
-    for name in EYES[:1] if options.quick else EYES:
+    for name in eyes:
         rows += time_rows(view, name, count)
-    narrow = linear_view(QUICK_SIZE_PX, fov_deg=NARROW_DEG)
-    for name in EYES[:1] if options.quick else EYES:
+    for name in eyes:
         rows += shortcut_rows(narrow, name)
-    if not options.quick:
-        for name in EYES:
-            rows += scene_rows(name)
-    publish("bands", rows, as_json=options.json, is_whole=not options.quick)
-
-
-if __name__ == "__main__":
-    main()
+    for name in () if run.is_quick else eyes:
+        rows += scene_rows(name)
+    return rows

@@ -1,43 +1,38 @@
 """Light of bright pixels beyond their kernels: error of a lamp's halo, and cost.
 
-    python -m tests.benchmarks.bench_edge_light [--quick] [--json]
-
 Halo: a pixel of 1,000 times white on black; error is the largest deviation of the light
 in a ring or a sixteenth of a ring outside its spot, up to 100 px, from brute force.
 Frames: 1280x720 with 8-bit output, the state changing with each frame, with this light
 and without, in turn, through both engines; error is that of the added light against
-every pixel by itself, as rms over the rms of leaving it out.  Writes
-results/edge_light.json.
+every pixel by itself, as rms over the rms of leaving it out.
 """
 
-import argparse
 import time
 from unittest import mock
 
 import numpy as np
 
 from estimator.profiles.parse import parse_profile
-from filter_service.gl.gpu import Gpu
 from filter_service.planning.plan import plan_cache
 from filter_service.psfs.eye_for_spec import eye_for_spec
 from filter_service.psfs.store import PsfStore, build_psf_store
 from filter_service.rendering import edge_kinds, edge_light
 from filter_service.rendering.edge_light import EdgeLight
 from filter_service.rendering.engine import ViewRequest
-from filter_service.rendering.gl import FilterRenderer
 from filter_service.rendering.media_effects import begin_through_media
 from filter_service.rendering.native import NativeRenderer
 from filter_service.rgbd_view import RgbdView
 from filter_service.view_state import State
+from tests.benchmarks.engines import ENGINES, open_renderer
 from tests.benchmarks.frame_runs import states_towards
-from tests.benchmarks.harness import Row, memory_mb, publish
+from tests.benchmarks.harness import Row, Run
+from tests.benchmarks.rows import row_of
 from tests.grid_specs import grid_spec
 from tests.numerical.scene_frames import scene_view
 from tests.numerical.synthetic import tangents
 from tests.reference.edge_light import lamp_light, ring_ratios
 
-SIZE, QUICK_SIZE = (1280, 720), (320, 180)
-COUNT, QUICK_COUNT = 12, 3
+MINUTES = 8
 LAMP, RADIUS_PX, PITCH_MRAD = 1000.0, 100, 0.7
 EMMETROPE = {
     "kind": "prescription",
@@ -53,9 +48,8 @@ LAMPS = {
 }
 
 
-def lamp_rows(quick: bool):
-    """Error of the light around lamps on the axis and at 30 deg."""
-    radius_px = 30 if quick else RADIUS_PX
+def lamp_rows(radius_px: int):
+    """Yield the errors of the light around lamps on the axis and at 30 deg."""
     width, height = 2 * radius_px + 60, 2 * radius_px + 40
     x, y = width // 2, height // 2
     fov_deg = float(np.degrees(height * PITCH_MRAD / 1e3))
@@ -102,10 +96,9 @@ def lamp_rows(quick: bool):
                 ("largest relative error of rings", np.abs(ratios[:, -1] - 1.0).max()),
                 ("of sixteenths of rings", np.nanmax(np.abs(ratios - 1.0))),
             ):
-                yield Row(
-                    *("edge_light", "halo", name, f"{eccentricity_deg:g} deg", 1),
-                    *(elapsed_ms, elapsed_ms, memory_mb()),
-                    *(error_name, float(error), "brute force"),
+                yield row_of(
+                    *("edge_light", "halo", name, f"{eccentricity_deg:g} deg"),
+                    *([elapsed_ms], error_name, error, "brute force"),
                 )
     engine.close()
 
@@ -150,7 +143,7 @@ def exact_limits():
     ]
 
 
-def frame_rows(size: tuple[int, int], count: int):
+def frame_rows(size: tuple[int, int], count: int, engines=ENGINES):
     """Added time of frames, and the error of limited numbers of sources and kernels."""
     view, colors = scenes(size)
     spec = grid_spec(
@@ -165,10 +158,8 @@ def frame_rows(size: tuple[int, int], count: int):
     store = build_psf_store(eye, spec)
     states = states_towards(spec, 4.5, 0.5, count)
     without = mock.patch.object(EdgeLight, "of", return_value=None)
-    for engine_name, engine in (
-        ("native", NativeRenderer()),
-        ("gl", FilterRenderer(Gpu())),
-    ):
+    for engine_name in engines:
+        engine = open_renderer(engine_name)
         handle = engine.load(store)
 
         def frame(color, state, output="srgb8", engine=engine, handle=handle):
@@ -193,11 +184,9 @@ def frame_rows(size: tuple[int, int], count: int):
                         times_ms[is_added].append(elapsed_ms)
             added_ms = np.array(times_ms[True]) - times_ms[False]
             error = limited_error(frame, without, color, states[0])
-            yield Row(
+            yield row_of(
                 *("edge_light", f"{engine_name}, added to a frame", name),
-                *(f"{size[0]}x{size[1]}", len(added_ms)),
-                *(float(np.median(added_ms)), float(np.percentile(added_ms, 95))),
-                *(memory_mb(), "rms of the added light", error),
+                *(f"{size[0]}x{size[1]}", added_ms, "rms of the added light", error),
                 "every pixel by itself",
             )
 
@@ -224,16 +213,8 @@ def limited_error(frame, without, color, state) -> float:
     return error / added if added else error
 
 
-def main() -> None:
-    """Run from the command line."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--quick", action="store_true", help="320x180")
-    parser.add_argument("--json", action="store_true", help="print the report alone")
-    options = parser.parse_args()
-    size, count = (QUICK_SIZE, QUICK_COUNT) if options.quick else (SIZE, COUNT)
-    rows = [*lamp_rows(options.quick), *frame_rows(size, count)]
-    publish("edge_light", rows, as_json=options.json, is_whole=not options.quick)
-
-
-if __name__ == "__main__":
-    main()
+def measure(run: Run) -> list[Row]:
+    """Return the rows of lamps and frames."""
+    if run.is_quick:
+        return [*lamp_rows(30), *frame_rows((160, 90), 2, ENGINES[:1])]
+    return [*lamp_rows(RADIUS_PX), *frame_rows((1280, 720), 12)]

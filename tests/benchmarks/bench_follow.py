@@ -1,23 +1,18 @@
 """Streams whose pupil and focus change in every frame: share of complete frames.
 
-    python -m tests.benchmarks.bench_follow [--quick] [--json]
-
 A frame is whole when it shows the state that it asks for and is delivered within two
 frame intervals of its submission; dropped frames count against it.  Walks: the demo's,
 and a panned photograph (`stream_walks`), at 480x270 and 30 frames a second, and at
 1280x720 and 8 a second or 0.6 of the eye's own frame rate, in this process and through
 the service; half way the eye changes.  Then, with calls that wait: the slowest frame of
 the walk against the median, and how long the first frame after a step takes (pupil 3 to
-6 mm and focus 0 to 2.5 dpt at once).  Error: the share of frames that are not whole.
-
-Rows of memory are alike on both ways: what the code says of stores, tables and buffers,
-and the PSS of every process, over 30 changes of the eye, with some frames of each.
-The process "program" includes the benchmark, its images and modules.
-Writes results/follow.json.
+6 mm and focus 0 to 2.5 dpt at once).  Error: the share of whole frames.  The setting
+also states the memory of stores, tables and buffers, and the PSS of every process; the
+process "program" includes the benchmark, its images and modules.
 """
 
-import argparse
 import math
+import sys
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -31,11 +26,13 @@ from filter_service.building.worker_handle import WorkerHandle
 from filter_service.filtering.builder import Builder
 from filter_service.filtering.stream_eyes import EyeReady
 from filter_service.rendering.native.renderer import NativeLanes
-from tests.benchmarks.harness import Row, memory_mb, publish
-from tests.benchmarks.process_memory import ManyEyes, MemoryUse, free_port
+from tests.benchmarks.harness import Row, Run
+from tests.benchmarks.process_memory import MemoryUse, free_port
 from tests.benchmarks.published_figures import CONDITIONS
+from tests.benchmarks.rows import row_of
 from tests.benchmarks.stream_walks import Moment, demo_walk, photograph_walk
 
+MINUTES = 12
 EYES = CONDITIONS
 STREAM_S = 6.0
 SIZES = (((480, 270), 30.0), ((1280, 720), 8.0))
@@ -43,9 +40,6 @@ OF_OWN_RATE = 0.6
 LIMITS = BuildLimits()
 STEP = ((3.0, 0.0), (6.0, 2.5))
 WAIT_S = 120.0
-CHANGES, FRAMES_OF_EACH = 30, 12
-STATE_S = 0.6
-"""Time in which the render worker reports its memory."""
 
 
 def preset(name: str) -> dict[str, str]:
@@ -141,20 +135,6 @@ class Following:
         seen.memory = MemoryUse.of_builder(self.builder)
         return seen
 
-    def change(self, eye: str, moments: Sequence[Moment]) -> MemoryUse:
-        """Change the eye and show it some frames; return the memory."""
-        generation = self.filter.set_profile(preset(eye)).generation
-        n_left = len(moments)
-        while n_left:
-            moment = moments[-n_left]
-            found = self.filter.filter(
-                moment.view,
-                pupil_diameter_mm=moment.pupil_diameter_mm,
-                focus_dpt=moment.focus_dpt,
-            )
-            n_left -= found.generation == generation
-        return MemoryUse.of_builder(self.builder)
-
 
 def served(
     eye: str, moments: Sequence[Moment], rate_hz: float, new_eye: str | None
@@ -208,65 +188,10 @@ def served(
     return seen
 
 
-def served_changes(eyes: Sequence[str], moments: Sequence[Moment]) -> ManyEyes:
-    """Change the eye of a session as `Following.change` does."""
-    from clients.filter_client import FilterClient
-    from clients.service_process import ServiceProcess
-
-    port = free_port()
-    settings = {"engine": "native", "metrics_port": port}
-    with (
-        ServiceProcess(settings, start_timeout_s=WAIT_S) as service,
-        FilterClient(service.endpoint, timeout_s=WAIT_S) as client,
-    ):
-
-        def change(k: int) -> MemoryUse:
-            client.request_profile(preset(eyes[k]), views=[moments[0].view])
-            n_left = len(moments)
-            while n_left:
-                moment = moments[-n_left]
-                found = client.filter(
-                    moment.view,
-                    pupil_diameter_mm=moment.pupil_diameter_mm,
-                    focus_dpt=moment.focus_dpt,
-                )
-                n_left -= found.generation > k
-            time.sleep(STATE_S)
-            return MemoryUse.of_service(service, port)
-
-        return ManyEyes.of(len(eyes), change)
-
-
-def memory_rows(size_px: tuple[int, int], count: int) -> list[Row]:
-    """Rows of memory over changes of the eye."""
-    moments = photograph_walk(size_px, FRAMES_OF_EACH, 30.0)
-    eyes = [EYES[k % len(EYES)] for k in range(count)]
-    with Following(eyes[-1], moments[0].view.camera) as following:
-        here = ManyEyes.of(count, lambda k: following.change(eyes[k], moments))
-    rows = []
-    for where, found in (
-        ("in process", here),
-        ("service", served_changes(eyes, moments)),
-    ):
-        largest_mb = math.nan if found.largest_mb is None else found.largest_mb
-        rows.append(
-            _row(
-                *(f"memory, {where}", f"all eyes {size_px[0]}", found.words, []),
-                *("PSS of all processes, MB", largest_mb),
-            )
-        )
-    return rows
-
-
 def _row(method: str, case: str, setting: str, times_ms, name: str, value) -> Row:
-    median_ms, p95_ms = (
-        (float(np.median(times_ms)), float(np.percentile(times_ms, 95)))
-        if len(times_ms)
-        else (math.nan, math.nan)
-    )
-    return Row(
-        *("follow", method, case, setting, len(times_ms), median_ms, p95_ms),
-        *(memory_mb(), name, float(value), "all submitted frames"),
+    return row_of(
+        *("follow", method, case, setting, times_ms, name, value),
+        "all submitted frames",
     )
 
 
@@ -316,42 +241,17 @@ def eye_rows(
     rows.append(
         _row("step", case, "", [took_ms], "first whole frame, s", took_ms / 1e3)
     )
-    _print(rows)
     return rows
 
 
-def _print(rows: Sequence[Row]) -> None:
-    for row in rows:
-        print(
-            f"{row.method:22} {row.case:18} {row.error_name:22} {row.error:8.3f}  "
-            f"median {row.median_ms:.1f} p95 {row.p95_ms:.1f} ms  {row.setting}",
-            flush=True,
-        )
-
-
-def main() -> None:
-    """Run from the command line."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true", help="one eye, one size")
-    parser.add_argument("--eyes", nargs="+", default=EYES, choices=EYES)
-    parser.add_argument("--memory", action="store_true", help="rows of memory only")
-    parser.add_argument("--json", action="store_true", help="print the report alone")
-    options = parser.parse_args()
-    sizes, eyes = (SIZES[:1], EYES[:1]) if options.quick else (SIZES, options.eyes)
-    stream_s = 3.0 if options.quick else STREAM_S
-    rows = [
-        row
-        for size_px, rate_hz in sizes
-        for eye in ([] if options.memory else eyes)
-        for row in eye_rows(eye, size_px, rate_hz, stream_s)
-    ]
-    for size_px, _ in sizes:
-        of_memory = memory_rows(size_px, 6 if options.quick else CHANGES)
-        _print(of_memory)
-        rows += of_memory
-    is_whole = not (options.quick or options.memory)
-    publish("follow", rows, as_json=options.json, is_whole=is_whole)
-
-
-if __name__ == "__main__":
-    main()
+def measure(run: Run) -> list[Row]:
+    """Return the rows of all eyes and sizes, or of one of each."""
+    sizes, eyes, stream_s = SIZES, EYES, STREAM_S
+    if run.is_quick:
+        sizes, eyes, stream_s = ((((96, 54), 30.0)),), EYES[:1], 1.0
+    rows: list[Row] = []
+    for size_px, rate_hz in sizes:
+        for eye in eyes:
+            rows += eye_rows(eye, size_px, rate_hz, stream_s)
+            print(f"{eye} {size_px[0]}", file=sys.stderr, flush=True)
+    return rows

@@ -1,49 +1,28 @@
 """Streams whose pupil and focus change in every frame: frame time and image error.
 
-    python -m tests.benchmarks.bench_live [--quick] [--json] [--gl]
-        [--eyes NAME ...] [--sizes WxH ...] [--threads N ...] [--tolerances X ...]
-        [--frames N] [--errors]
-
-The demo's walk through *Courtyard*, colour and depth as a client sends them, 8-bit
+The demo's walk through the courtyard, color and depth as a client sends them, 8-bit
 sRGB in and out, over the whole visual field ("dynamic"): every frame has another view,
 pupil and focus, so that its kernels are blended anew.  Rendering the scene is not in
-the times.
+the times.  The OpenGL engine is measured in the same run, in few frames where it has no
+GPU, and live.png shows the times of the stages of both.
 
 The error is that of one frame of the walk, in linear light, against the dense
 reference: the exact PSF of every pixel, in bins of 0.2 degrees and 0.005 dpt.  Of large
 frames three windows of 256 x 256 are judged (middle, left edge, corner), as a reference
-of the whole takes tens of minutes.  References are kept under out/dense_references;
-without ``--errors`` only what lies there is used.
-
-``--gl`` measures the OpenGL engine in the same run, in few frames where it has no GPU,
-and draws the times of the stages of both, results/live.png.
+of the whole takes tens of minutes.  References are kept under out/dense_references.
 """
 
-import argparse
-import json
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
-import numpy as np
-
-from clients.commands.options import read_size_px
 from clients.pyrender_stream import path_settings
 from filter_service.gl_device import is_software_renderer
 from filter_service.psfs.store import build_psf_store
 from filter_service.rendering.native import NativeRenderer
 from tests.benchmarks.engines import open_renderer
-from tests.benchmarks.harness import (
-    OUT,
-    RESULTS,
-    Row,
-    machine_info,
-    memory_mb,
-    print_rows,
-    report,
-    write_report,
-)
-from tests.benchmarks.live_picture import plot_stages
+from tests.benchmarks.harness import RESULTS, Row, Run
 from tests.benchmarks.live_walk import (
     SCENE,
     WHOLE_PIXELS,
@@ -54,38 +33,24 @@ from tests.benchmarks.live_walk import (
     walk_times,
 )
 from tests.benchmarks.published_figures import CONDITIONS
+from tests.benchmarks.rows import row_of
 from tests.grid_specs import grid_spec
 from tests.numerical.plan_cases import traced_eye
 
+MINUTES = 90
+SIZES = ((480, 270), (1280, 720))
 SOFTWARE_GL_FRAMES = 3
 """Of the walk, where OpenGL is the processor's work."""
 
 
-@dataclass(frozen=True)
-class Case:
-    """What rows of one eye, size and way have in common."""
-
-    eye: str
-    setting: str
-    n: int
-    error_db: float
-    reference: str
-
-    def row(self, method: str, times_ms: list[float]) -> Row:
-        """Return a row of a method or stage."""
-        return Row(
-            bench="live",
-            method=method,
-            case=self.eye,
-            setting=self.setting,
-            n=self.n,
-            median_ms=float(np.median(times_ms)),
-            p95_ms=float(np.percentile(times_ms, 95)),
-            memory_mb=memory_mb(),
-            error_name="psnr_db",
-            error=self.error_db,
-            reference=self.reference,
-        )
+STAGES = {  # of the picture: those of the engines
+    "plan of kernels": ("psf_plan",),
+    "kernels": ("psf_blend", "upload"),
+    "fragments": ("prepare", "fragments"),
+    "merging": ("merge",),
+    "lists and order": ("bin", "sort"),
+    "splat (native: and lists)": ("splat", "encode", "readback"),
+}
 
 
 @dataclass(frozen=True)
@@ -98,96 +63,107 @@ class Way:
     frame_count: int | None = None
 
 
-def ways_of(options: argparse.Namespace, gl) -> Iterator[Way]:
-    """OpenGL, if it is there; the native engine on cores, and at tolerances."""
+def ways_of(gl) -> Iterator[Way]:
+    """Yield OpenGL, if it is there, and the native engine on one and two cores."""
     if gl is not None:
         few = SOFTWARE_GL_FRAMES if is_software_renderer(gl.name) else None
         yield Way("GL", gl, frame_count=few)
-    for n_threads in options.threads:
+    for n_threads in (1, 2):
         cores = f"{n_threads} core" + "s" * (n_threads > 1)
         renderer = NativeRenderer(n_threads=n_threads)
         yield Way(cores, renderer)
-        if n_threads == max(options.threads):
-            for tolerance in options.tolerances:
-                name = f"{cores}, tolerance {tolerance:g}"
-                yield Way(name, renderer, tolerance)
+        if n_threads == 2:
+            for tolerance in (1.4, 2.0):
+                yield Way(f"{cores}, tolerance {tolerance:g}", renderer, tolerance)
         renderer.close()
 
 
-def eye_rows(eye: str, walk: Walk, ways: Iterator[Way], judge: Judge) -> list[Row]:
-    """Rows of one eye and size, each way and its stages."""
+def eye_rows(eye: str, walk: Walk, gl) -> list[Row]:
+    """Return the rows of one eye and size, each way and its stages."""
+    judge = Judge.of(walk, eye, compute=True)
     spec = grid_spec(**walk.camera, mode="dynamic", **path_settings(SCENE))
     store = build_psf_store(traced_eye(eye, spec), spec)
     reference = "dense, over the field, bins of 0.2 deg and 0.005 dpt"
     if judged_windows(walk.size_px) != [None]:
         reference += f", three windows of {WINDOW_PX} x {WINDOW_PX} px"
     rows: list[Row] = []
-    for way in ways:
+    for way in ways_of(gl):
         handle = way.renderer.load(store)
         error_db = judge.error_db(way.renderer, handle, way.tolerance)
         of_way = walk.shortened(way.frame_count)
         times_ms, stages_ms = walk_times(way.renderer, handle, of_way, way.tolerance)
-        setting = f"{walk.size_px[0]}x{walk.size_px[1]} {way.name}"
-        case = Case(eye, setting, len(times_ms), error_db, reference)
-        rows.append(case.row("frame", times_ms))
+        parts = {f"  {k.removesuffix('_ms')}": [v] for k, v in stages_ms.items()}
         rows += [
-            case.row(f"  {stage.removesuffix('_ms')}", [median_ms])
-            for stage, median_ms in stages_ms.items()
+            row_of(
+                *(
+                    "live",
+                    method,
+                    eye,
+                    f"{walk.size_px[0]}x{walk.size_px[1]} {way.name}",
+                ),
+                *(own_ms, "psnr_db", error_db, reference),
+                n=len(times_ms),
+            )
+            for method, own_ms in {"frame": times_ms, **parts}.items()
         ]
     return rows
 
 
-def main(argv: list[str] | None = None) -> None:
-    """Run, print, and write tests/benchmarks/results/live.json."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--quick", action="store_true", help="one eye, 192x108")
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
-    parser.add_argument("--eyes", nargs="+", default=CONDITIONS, choices=CONDITIONS)
-    parser.add_argument("--sizes", nargs="+", type=read_size_px, metavar="WxH")
-    parser.add_argument("--threads", nargs="+", type=int, default=[1, 2], metavar="N")
-    parser.add_argument(
-        "--frames", type=int, metavar="N", help="24, of large frames 12"
+def plot_stages(rows: Sequence[Row], path: Path) -> None:
+    """A panel for each frame size and engine, eyes side by side."""
+    from matplotlib.figure import Figure
+
+    sizes = sorted({row.setting.split()[0] for row in rows}, key=len)
+    figure = Figure(figsize=(11.0, 4.2 * len(sizes)), layout="constrained")
+    panels = figure.subplots(len(sizes), 2, squeeze=False)
+    for line, size in zip(panels, sizes, strict=True):
+        for axes, way in zip(line, ("GL", "2 cores"), strict=True):
+            _plot_way(axes, [r for r in rows if r.setting == f"{size} {way}"])
+            engine = "OpenGL in software" if way == "GL" else "native, two cores"
+            axes.set_title(f"{size}, {engine}", fontsize=10)
+    figure.legend(
+        *panels[0][1].get_legend_handles_labels(), loc="outside lower center", ncols=6
     )
-    parser.add_argument(
-        "--tolerances",
-        nargs="*",
-        type=float,
-        default=[1.4, 2.0],
-        metavar="X",
-        help="others than the usual 1, on most cores",
-    )
-    parser.add_argument("--gl", action="store_true", help="the OpenGL engine too")
-    parser.add_argument(
-        "--errors", action="store_true", help="compute references that lack"
-    )
-    options = parser.parse_args(argv)
-    sizes = options.sizes or [(480, 270), (1280, 720)]
-    eyes = options.eyes
-    if options.quick:
-        sizes, eyes = [(192, 108)], eyes[:1]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=110)
+
+
+def _plot_way(axes, rows: Sequence[Row]) -> None:
+    eyes = list(dict.fromkeys(row.case for row in rows))
+    below_ms = [0.0] * len(eyes)
+    for stage, parts in STAGES.items():
+        times_ms = [
+            sum(
+                r.median_ms for r in rows if r.case == eye and r.method.strip() in parts
+            )
+            for eye in eyes
+        ]
+        axes.bar(eyes, times_ms, bottom=below_ms, label=stage, width=0.7)
+        below_ms = [a + b for a, b in zip(below_ms, times_ms, strict=True)]
+    for place, eye in enumerate(eyes):
+        (frame,) = (r for r in rows if r.case == eye and r.method == "frame")
+        axes.annotate(
+            f"{frame.median_ms:.0f} ms\n{frame.error:.1f} dB",
+            (place, below_ms[place]),
+            ha="center",
+            va="bottom",
+            fontsize=8,
+        )
+    axes.set_ylim(0.0, 1.25 * max(below_ms, default=1.0))
+    axes.set_ylabel("ms a frame")
+    axes.tick_params(axis="x", labelsize=8)
+
+
+def measure(run: Run) -> list[Row]:
+    """Return the rows of all eyes and sizes, or of a small one."""
     rows: list[Row] = []
-    gl = open_renderer("gl") if options.gl else None
-    for size_px in sizes:
-        usual = 24 if size_px[0] * size_px[1] <= WHOLE_PIXELS else 12
-        walk = Walk.of(size_px, options.frames or usual)
-        for eye in eyes:
-            errors = options.errors or options.quick
-            judge = Judge.of(walk, eye, compute=errors)
-            rows += eye_rows(eye, walk, ways_of(options, gl), judge)
+    gl = None if run.is_quick else open_renderer("gl")
+    for size_px in ((96, 54),) if run.is_quick else SIZES:
+        count = 24 if size_px[0] * size_px[1] <= WHOLE_PIXELS else 12
+        walk = Walk.of(size_px, count)
+        for eye in CONDITIONS[: 1 if run.is_quick else None]:
+            rows += eye_rows(eye, walk, gl)
             print(f"{size_px} {eye}", file=sys.stderr, flush=True)
-    renderers = {} if gl is None else {"gl": gl.name}
-    content = report(rows, machine={**machine_info(), "renderers": renderers})
-    for row in content["rows"]:
-        row["error"] = None if np.isnan(row["error"]) else row["error"]
-    if options.json:
-        print(json.dumps(content))
-        return
-    print_rows(rows)
-    if not options.quick:
-        print(write_report("live", content).relative_to(RESULTS.parents[2]))
     if gl is not None:
-        plot_stages(rows, (OUT if options.quick else RESULTS) / "live.png")
-
-
-if __name__ == "__main__":
-    main()
+        plot_stages(rows, RESULTS / "live.png")
+    return rows

@@ -1,7 +1,5 @@
 """Merging that follows the gaze: time and work saved, errors and flicker.
 
-    python -m tests.benchmarks.bench_periphery [--quick] [--json]
-
 The courtyard, the primitives and a photograph with depth, as in a headset (96 degrees)
 and on a desktop (50 degrees, vertically), through three eyes, 8-bit sRGB in and out.
 The viewer looks straight ahead; pupil and focus change with every frame.  Frames with
@@ -19,15 +17,13 @@ al. 1982) and by 0.043 above (`filter_service/rendering/frame.py`).
 
 Flicker: the same picture while only the gaze moves, the difference of consecutive
 frames by the same measure: tracker errors of 1 degree RMS, pursuit at 10 deg/s and 72
-Hz, and the frame after a saccade of 15 degrees.  Writes results/periphery.json.
+Hz, and the frame after a saccade of 15 degrees (``flicker``).
 """
 
-import argparse
-import json
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,19 +41,15 @@ from filter_service.rendering.native.frame_record import FrameRecord
 from filter_service.rgbd_view import RgbdView
 from tests.benchmarks.frame_runs import states_towards
 from tests.benchmarks.gpu_cases import EYES, FOCUS_DPT, PUPIL_MM
-from tests.benchmarks.harness import (
-    Row,
-    memory_mb,
-    print_rows,
-    report,
-    write_report,
-)
+from tests.benchmarks.harness import Row, Run
 from tests.benchmarks.photograph import motorcycle
+from tests.benchmarks.rows import row_of
 from tests.benchmarks.splat_work import splat_work
 from tests.grid_specs import grid_spec
 from tests.numerical.scene_frames import scene_view
 from tests.numerical.synthetic import psnr_db, tangents
 
+MINUTES = 35
 SCENES = ("courtyard", "primitives", "photograph")
 SIZES = {"1832x1920": ((1832, 1920), 96.0), "1280x720": ((1280, 720), 50.0)}
 GL_CASES = (("courtyard", "emmetropia"), ("courtyard", "-6 dpt"))
@@ -79,8 +71,6 @@ SIGMA_CYCLES = 0.265
 DARKEST = 0.002
 """Of white: the light that a display leaves in black."""
 
-REFERENCE = "without merging"
-
 
 @dataclass(frozen=True)
 class PeripheryRow(Row):
@@ -94,19 +84,6 @@ class PeripheryRow(Row):
     near_db: float
     detected_percent: float
     direct_percent: float
-
-
-@dataclass(frozen=True)
-class FlickerRow:
-    """Differences of consecutive frames under a moving gaze."""
-
-    bench: str
-    case: str
-    setting: str
-    movement: str
-    detected_percent: float
-    worst_percent: float
-    psnr_db: float
 
 
 @dataclass(frozen=True)
@@ -174,8 +151,8 @@ def merged_for_a_display() -> Iterator[None]:
     """Merge linear output of the native engine as if it were encoded: no rounding."""
     plain = FrameRecord.set_merging
 
-    def encoded(self, **values):
-        plain(self, **{**values, "is_encoded": True})
+    def encoded(self, *arguments, **values):
+        plain(self, *arguments, **{**values, "is_encoded": True})
 
     FrameRecord.set_merging = encoded
     try:
@@ -235,8 +212,8 @@ class Errors:
             "direct_percent": 100.0 * float(np.mean(direct[far] > 1.0)),
         }
 
-    def flicker(self) -> Iterator[FlickerRow]:
-        """Yield a row for each movement of the gaze."""
+    def flicker(self) -> Iterator[dict]:
+        """Yield the differences of consecutive frames for each movement of the gaze."""
         rng = np.random.default_rng(1)
         around = [tuple(angles) for angles in rng.normal(0.0, 1.0, (6, 2)).tolist()]
         movements = {  # gazes as told, and where the viewer looks
@@ -255,11 +232,15 @@ class Errors:
                     detected.append(100.0 * float(np.mean(seen > 1.0)))
                     db.append(psnr_db(image, last))
                 last = image
-            yield FlickerRow(
-                *("periphery", self.scene.eye),
-                *(f"{self.scene.size} {self.scene.name}", name),
-                *(float(np.mean(detected)), max(detected), min(db)),
-            )
+            yield {
+                "bench": "periphery",
+                "case": self.scene.eye,
+                "setting": f"{self.scene.size} {self.scene.name}",
+                "movement": name,
+                "detected_percent": float(np.mean(detected)),
+                "worst_percent": max(detected),
+                "psnr_db": min(db),
+            }
 
 
 def timed(renderer, handle, scene: Scene, count: int, gpu: Gpu | None = None):
@@ -299,60 +280,34 @@ def rows_of(scene: Scene, engines: dict, *, is_quick: bool) -> Iterator[Peripher
         times_ms, last = timed(renderer, handle, scene, count, gpu)
         for is_on in (0, 1):
             (seen, work), (plain, plain_work) = last[is_on], last[0]
-            yield PeripheryRow(
+            found = dict(measured[is_on])
+            yield row_of(
                 *("periphery", method, scene.eye),
                 f"{scene.size} {scene.name} {'on' if is_on else 'off'}",
-                count,
-                float(np.median(times_ms[is_on])),
-                float(np.percentile(times_ms[is_on], 95)),
-                memory_mb(),
-                "psnr_db",
-                measured[is_on]["error"],
-                REFERENCE,
+                *(times_ms[is_on], "psnr_db", found.pop("error"), "without merging"),
+                kind=PeripheryRow,
                 time_ratio=float(np.median(times_ms[is_on] / times_ms[0])),
                 fragment_ratio=seen.fragment_count / plain.fragment_count,
                 entry_ratio=seen.entry_count / plain.entry_count,
                 texel_ratio=seen.kernel_texel_count / plain.kernel_texel_count,
                 evaluation_ratio=work and work / plain_work,
-                near_db=measured[is_on]["near_db"],
-                detected_percent=measured[is_on]["detected_percent"],
-                direct_percent=measured[is_on]["direct_percent"],
+                **found,
             )
         handle.release()
 
 
-def flicker_of(scene: Scene, renderer: NativeRenderer) -> Iterator[FlickerRow]:
-    """Yield the flicker rows of a scene."""
-    handle = renderer.load(scene.store)
-    yield from Errors(scene, renderer, handle).flicker()
-    handle.release()
-
-
-def main() -> None:
-    """Measure, print, write."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--quick", action="store_true", help="one small size and eye")
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
-    arguments = parser.parse_args()
-    is_quick = arguments.quick
-    eyes = {"emmetropia": EYES["emmetropia"]} if is_quick else EYES
-    gpu = Gpu()
-    engines = {"native": (NativeRenderer(), None), "gl": (FilterRenderer(gpu), gpu)}
+def measure(run: Run) -> tuple[list[Row], dict[str, list[dict]]]:
+    """Return the rows of all scenes and eyes, or of small scenes and one eye."""
+    eyes = {"emmetropia": EYES["emmetropia"]} if run.is_quick else EYES
+    gpu, native = Gpu(), NativeRenderer()
+    engines = {"native": (native, None), "gl": (FilterRenderer(gpu), gpu)}
     rows: list[Row] = []
-    flicker: list[FlickerRow] = []
-    names, sizes = (QUICK_SCENES, QUICK_SIZES) if is_quick else (SCENES, SIZES)
+    flicker: list[dict] = []
+    names, sizes = (QUICK_SCENES, QUICK_SIZES) if run.is_quick else (SCENES, SIZES)
     for scene in scenes_of(names, sizes, eyes):
-        rows += rows_of(scene, engines, is_quick=is_quick)
+        rows += rows_of(scene, engines, is_quick=run.is_quick)
         if scene.eye == "emmetropia":
-            flicker += flicker_of(scene, engines["native"][0])
-    content = {**report(rows), "flicker": [asdict(row) for row in flicker]}
-    if not is_quick:
-        write_report("periphery", content)
-    if arguments.json:
-        print(json.dumps(content))
-    else:
-        print_rows(rows)
-
-
-if __name__ == "__main__":
-    main()
+            handle = native.load(scene.store)
+            flicker += Errors(scene, native, handle).flicker()
+            handle.release()
+    return rows, {"flicker": flicker}

@@ -8,7 +8,6 @@ add up.
 import os
 import socket
 import urllib.request
-from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -120,47 +119,6 @@ class MemoryUse:
         return (
             f"stores {self.stores_mb:.1f} MB, tables {self.tables_mb:.1f}, buffers "
             f"{self.buffers_mb:.0f}; PSS in MB: {', '.join(parts)}"
-        )
-
-
-@dataclass(frozen=True)
-class ManyEyes:
-    """Memory after each of many changes of the eye."""
-
-    uses: Sequence[MemoryUse]
-
-    @classmethod
-    def of(cls, count: int, change: Callable[[int], MemoryUse]) -> Self:
-        """Change the eye ``count`` times; ``change(k)`` returns the memory after it."""
-        return cls([change(k) for k in range(count)])
-
-    @property
-    def largest_mb(self) -> float | None:
-        """Return the largest PSS of all processes; None if it is not available."""
-        totals = [use.total_mb for use in self.uses]
-        known = [total for total in totals if total is not None]
-        return max(known) if len(known) == len(totals) else None
-
-    @property
-    def growth_mb(self) -> float | None:
-        """Return how much more the last third takes than the middle third, at most."""
-        third = len(self.uses) // 3
-        parts = (self.uses[third : 2 * third], self.uses[-third:])
-        totals = [[use.total_mb or 0.0 for use in part] for part in parts]
-        if self.largest_mb is None:
-            return None
-        return max(totals[1]) - max(totals[0])
-
-    @property
-    def words(self) -> str:
-        """Return the largest values, and the growth, in words."""
-        growth = self.growth_mb
-        told = "not available" if growth is None else f"{growth:+.0f} MB"
-        largest = max(self.uses, key=lambda use: use.total_mb or 0.0)
-        return (
-            f"stores up to {max(use.stores_mb for use in self.uses):.1f} MB; last "
-            f"third of {len(self.uses)} eyes against the second: {told}; largest: "
-            f"{largest.words}"
         )
 
 

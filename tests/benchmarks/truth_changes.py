@@ -1,7 +1,6 @@
 """Changes of frames while the change of their input is halved, for `bench_truth`."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,20 +44,6 @@ def views() -> dict[str, RgbdView]:
     }
 
 
-@dataclass(frozen=True)
-class Halvings:
-    """Changes of a frame with a step that is halved each time.
-
-    Attributes
-    ----------
-    largest, rms : (n,)
-        Change of light, from the largest step to the smallest.
-    """
-
-    largest: NDArray[np.float64]
-    rms: NDArray[np.float64]
-
-
 def least_ratio(changes: NDArray[np.float64]) -> float | None:
     """Return the least ratio of consecutive changes, down to `LEAST_CHANGE`.
 
@@ -92,10 +77,12 @@ def halvings(
     engine: str,
     *,
     tolerances: tuple[float, ...],
-    count: int = HALVINGS,
-    mode: str = "dynamic",
-) -> dict[tuple[str, float], Halvings]:
-    """Return the changes of a frame by input and tolerance."""
+) -> dict[tuple[str, float], dict[str, NDArray[np.float64]]]:
+    """Return the changes of a frame by input and tolerance.
+
+    They are the "largest" and the "rms" change of light (n,), from the largest step to
+    the smallest.
+    """
     found = {}
     for is_gaze in (False, True):
         own = [name for name in inputs if (name == "gaze") == is_gaze]
@@ -103,7 +90,7 @@ def halvings(
             continue
         reach_deg = GAZE_RANGE_DEG if is_gaze else 0.0
         settings = {
-            "mode": mode,
+            "mode": "dynamic",
             "focus_range_dpt": (0.0, 10.0),
             "gaze_range_deg": (reach_deg, reach_deg),
         }
@@ -128,10 +115,10 @@ def halvings(
                     still = frame(name, 0.0, tolerance)
                     changes = [
                         frame(name, first / 2.0**k, tolerance) - still
-                        for k in range(count)
+                        for k in range(HALVINGS)
                     ]
-                    found[name, tolerance] = Halvings(
-                        np.array([np.abs(change).max() for change in changes]),
-                        np.array([np.sqrt(np.mean(change**2)) for change in changes]),
-                    )
+                    found[name, tolerance] = {
+                        "largest": np.array([np.abs(c).max() for c in changes]),
+                        "rms": np.array([np.sqrt(np.mean(c**2)) for c in changes]),
+                    }
     return found

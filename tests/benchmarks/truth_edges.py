@@ -1,7 +1,7 @@
-"""Lamps beside edges, windows of frames, and distant light, for `bench_truth`."""
+"""Lamps beside edges, and windows of frames, for `bench_truth`."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,25 +34,6 @@ EDGES_DPT = {"emmetropia": 3.0, "myopia": 8.0, "post_lasik": 3.0}
 """Eyes, and a distance that they can focus on."""
 
 
-@dataclass(frozen=True)
-class LampEnergy:
-    """Light of a lamp in a frame, relative to the lamp's, by distance and color (n, 3).
-
-    Attributes
-    ----------
-    seen : (n, 3)
-    image : (n, 3)
-        Share of the lamp's image that does not fall on nearer pixels.
-    rays : (n, 3)
-        Share of the pupil whose rays to the lamp pass the edge.  They do so wherever
-        aberrations send their light; where the edge is sharp, the shares are equal.
-    """
-
-    seen: NDArray[np.float64]
-    image: NDArray[np.float64]
-    rays: NDArray[np.float64]
-
-
 def lamp_energies(
     eye_name: str,
     engine: str,
@@ -60,8 +41,12 @@ def lamp_energies(
     *,
     tolerances: tuple[float, ...] = (0.0, 1.0),
     distances_px: tuple[int, ...] = (1, 2, 3, 4, 5, 6),
-) -> dict[tuple[str, str, float], LampEnergy]:
-    """Return energies by place (behind, before), layers and tolerance.
+) -> dict[tuple[str, str, float], tuple[NDArray, NDArray, NDArray]]:
+    """Return lights of a lamp by place (behind, before), layers and tolerance.
+
+    Each is relative to the lamp's, by distance and color (n, 3): that in the frame, the
+    share of the lamp's image that does not fall on nearer pixels, and the share of the
+    pupil whose rays to the lamp pass the edge, wherever aberrations send their light.
 
     The surface at the left, up to `EDGE_X_PX`, is black and in focus.  The lamp is a
     pixel of the other one, whose pixel center is 0.5 px less than its distance from the
@@ -109,8 +94,8 @@ def lamp_energies(
                             render_tolerance=tolerance,
                         )
                         rows.append(seen.color.sum(axis=(0, 1), dtype=np.float64))
-                    found[place, layers, tolerance] = LampEnergy(
-                        np.array(rows), *(shares or (np.ones((len(rows), 3)),) * 2)
+                    found[place, layers, tolerance] = (
+                        *(np.array(rows), *(shares or (np.ones((len(rows), 3)),) * 2)),
                     )
     return found
 
@@ -218,47 +203,3 @@ def picture(camera: Camera) -> RgbdView:
     )
     light = linear_from_srgb(color).astype(np.float32)
     return RgbdView(light, depth_m, camera.tangents, "radial")
-
-
-LAMP_LIGHT = 20.0
-LAMP_AT_PX = {"sampled": (32, 120), "not sampled": (35, 117)}
-"""Place of a lamp, among the pixels from which the white level is found, and not."""
-
-FAR_PX = 180
-
-
-def far_changes(
-    eye_name: str,
-    engine: str,
-    truth: PointTruth,
-    *,
-    tolerances: tuple[float, ...] = (0.0, 1.0),
-) -> dict[tuple[str, float], float]:
-    """Return the largest change of pixels from `FAR_PX` on by a lamp at the left.
-
-    The lamp's own light by the reference is subtracted; by place and tolerance.
-    """
-    camera = camera_at(0.0, 0.0, CROP_FULL_PX)
-    view = picture(camera)
-    found = {}
-    with opened(eye_name, camera, engine, mode="dynamic") as eye_filter:
-        for at, (x, y) in LAMP_AT_PX.items():
-            with_lamp = view.color.copy()
-            with_lamp[y, x] = LAMP_LIGHT
-            state = replace(CROP_STATE, object_dpt=1.0 / float(view.depth_m[y, x]))
-            images = truth.images(
-                wavefronts_of(eye_filter, camera, x, y, state), max(CROP_FULL_PX)
-            )
-            own = np.stack([placed(i, x, y, CROP_FULL_PX) for i in images], axis=-1)
-            own *= LAMP_LIGHT - view.color[y, x]
-            for tolerance in tolerances:
-                plain, lit = (
-                    filtered(
-                        *(eye_filter, color, view.depth_m, camera, CROP_STATE),
-                        render_tolerance=tolerance,
-                    ).color.astype(np.float64)
-                    for color in (view.color, with_lamp)
-                )
-                change = (lit - plain - own)[:, FAR_PX:]
-                found[at, tolerance] = float(np.abs(change).max())
-    return found

@@ -21,17 +21,10 @@ from filter_service.settings import FilterSettings
 from tests.benchmarks.harness import OUT
 from tests.reference.point_image import PointWavefront, point_wavefronts
 
-EYES = (
-    *("emmetropia", "myopia", "astigmatism"),
-    *("keratoconus", "cataract", "post_lasik"),
-)
 PITCH_MRAD = 1.0
-WIDE_PX = 1240, 880
-"""Frame of +-32 by +-24 degrees."""
-
 WINDOW_PX = 201, 121
 REACH_PX = 110
-"""Distance to which a point is compared, in a wide frame."""
+"""Distance to which a point is compared."""
 
 GRAY = 0.25
 """Light of the other pixels of a gray frame."""
@@ -77,15 +70,6 @@ PLACES_DEG = (
     (-19.9, -12.7),
 )
 """Azimuth and elevation; every fourth place has the same state."""
-
-
-def pixel_at(camera: Camera, h_deg: float, v_deg: float) -> tuple[int, int]:
-    """Return the column and row of a direction (azimuth, elevation)."""
-    left, right, up, down = camera.tangents
-    tangent_x, tangent_y = tangents_at(h_deg, v_deg)
-    x = (tangent_x - left) / (right - left) * camera.width_px
-    y = (up - tangent_y) / (up - down) * camera.height_px
-    return int(np.floor(x)), int(np.floor(y))
 
 
 def filtered(
@@ -184,38 +168,24 @@ class PointFrame:
     energy_ratio : (3,)
         Light in the whole frame.
     frame_ms : float
-    has_edge_light : bool
-        Whether the path of bright pixels was taken.
     """
 
     seen: NDArray[np.float64]
     exact: NDArray[np.float64]
     energy_ratio: NDArray[np.float64]
     frame_ms: float
-    has_edge_light: bool
 
     @property
     def errors(self) -> NDArray[np.float64]:
         """Half the sum of absolute differences (3,) of the colors."""
         return np.abs(self.seen - self.exact).sum(axis=(0, 1)) / 2.0
 
-    def centroid_px(self, is_exact: bool, radius_px: int) -> NDArray[np.float64]:
-        """Return the centroids (3, 2) of a square around the point; y is downward."""
-        light = self.exact if is_exact else self.seen
-        middle = light.shape[0] // 2, light.shape[1] // 2
-        light = light[
-            middle[0] - radius_px : middle[0] + radius_px + 1,
-            middle[1] - radius_px : middle[1] + radius_px + 1,
-        ]
-        along = np.arange(-radius_px, radius_px + 1.0)
-        total = light.sum(axis=(0, 1))
-        return np.stack(
-            [
-                np.einsum("yxc,x->c", light, along) / total,
-                np.einsum("yxc,y->c", light, along) / total,
-            ],
-            axis=1,
-        )
+
+def centroids_px(light: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the centroids x, y (3, 2) from the middle; y is downward."""
+    y, x = (np.arange(n) - n // 2 for n in light.shape[:2])
+    moments = [np.einsum("yxc,x->c", light, x), np.einsum("yxc,y->c", light, y)]
+    return np.stack(moments, axis=1) / light.sum(axis=(0, 1))[:, None]
 
 
 @contextmanager
@@ -229,69 +199,40 @@ def opened(profile, camera: Camera, engine: str, **settings) -> Iterator[EyeFilt
         yield eye_filter
 
 
-def point_frames(
+def point_frame(
     eye_filter: EyeFilter,
     camera: Camera,
-    pixels: Sequence[tuple[int, int]],
     state: PointState,
     truth: PointTruth,
     *,
-    reach_px: tuple[int, int] = (REACH_PX, REACH_PX),
+    reach_px: int = REACH_PX,
     is_gray: bool = False,
-    tolerance: float = 0.0,
-) -> list[PointFrame]:
-    """Filter points of light 1 in one frame; each has the light nearest to it.
+) -> PointFrame:
+    """Filter a point of light 1 in the middle of a frame.
 
     Parameters
     ----------
-    reach_px : (x, y)
-        Distance to which points are compared.
+    reach_px : int
+        Distance to which it is compared, within the frame.
     is_gray : bool
-        Whether the other pixels are gray, so that points are not bright; the light of
+        Whether the other pixels are gray, so that the point is not bright; the light of
         the gray frame alone is subtracted.
     """
-    height, width = camera.height_px, camera.width_px
-    color = np.full((height, width, 3), GRAY if is_gray else 0.0, np.float32)
+    size = camera.width_px, camera.height_px
+    x, y = (n // 2 for n in size)
+    color = np.full((size[1], size[0], 3), GRAY if is_gray else 0.0, np.float32)
     depth_m = 1.0 / max(state.object_dpt, 1e-6)
-
-    def frame():
-        return filtered(
-            eye_filter, color, depth_m, camera, state, render_tolerance=tolerance
-        )
-
-    below = frame().color.astype(np.float64)  # after its PSFs are computed
-    for x, y in pixels:
-        color[y, x] = 1.0
+    below = filtered(eye_filter, color, depth_m, camera, state)  # computes its PSFs
+    color[y, x] = 1.0
     start_s = time.perf_counter()
-    found = frame()
+    found = filtered(eye_filter, color, depth_m, camera, state)
     frame_ms = 1e3 * (time.perf_counter() - start_s)
-    light = (found.color - below) / (1.0 - GRAY if is_gray else 1.0)
-    rows, columns = np.mgrid[:height, :width]
-    distances = np.stack([np.hypot(columns - x, rows - y) for x, y in pixels])
-    nearest = distances.argmin(axis=0)
-    frames = []
-    for number, (x, y) in enumerate(pixels):
-        points = wavefronts_of(eye_filter, camera, x, y, state)
-        exact = np.zeros((2 * reach_px[1] + 1, 2 * reach_px[0] + 1, 3))
-        seen = exact.copy()
-        x0, y0 = max(x - reach_px[0], 0), max(y - reach_px[1], 0)
-        x1, y1 = min(x + reach_px[0] + 1, width), min(y + reach_px[1] + 1, height)
-        part = slice(y0, y1), slice(x0, x1)
-        there = (
-            slice(y0 - y + reach_px[1], y1 - y + reach_px[1]),
-            slice(x0 - x + reach_px[0], x1 - x + reach_px[0]),
-        )
-        images = truth.images(points, max(reach_px))
-        for channel, image in enumerate(images):
-            exact[(*there, channel)] = placed(image, x, y, (width, height))[part]
-        seen[there] = light[part]
-        frames.append(
-            PointFrame(
-                *(seen, exact, light[nearest == number].sum(axis=0), frame_ms),
-                "edge_light_ms" in found.stage_times_ms,
-            )
-        )
-    return frames
+    light = found.color - below.color.astype(np.float64)
+    light /= 1.0 - GRAY if is_gray else 1.0
+    images = truth.images(wavefronts_of(eye_filter, camera, x, y, state), reach_px)
+    exact = np.stack([placed(image, x, y, size) for image in images], axis=-1)
+    part = tuple(slice(max(at - reach_px, 0), at + reach_px + 1) for at in (y, x))
+    return PointFrame(light[part], exact[part], light.sum(axis=(0, 1)), frame_ms)
 
 
 COLOR_PLACES_DEG = (
@@ -304,39 +245,19 @@ COLOR_PX, COLOR_RADIUS_PX = (81, 81), 30
 COLOR_STATE = PointState(3.0, 0.5, 0.5)
 
 
-@dataclass(frozen=True)
-class LateralColor:
-    """Lateral color of points, in frames and by the reference.
+def lateral_color(
+    profile, engine: str, truth: PointTruth
+) -> tuple[float, float, list[float]]:
+    """Compare the lateral color of points at `COLOR_PLACES_DEG`, in windows.
 
-    Attributes
-    ----------
-    seen_px, exact_px : (n, 2, 2)
-        Centroids x, y of red and blue minus that of green.
-    mrad_per_px : (n,)
-        Largest angle of a pixel.
-    frames_ms : (n,)
+    Returns
+    -------
+    error_px, error_mrad : float
+        Largest difference, along x or y and as a distance, between the centroids of red
+        or blue minus that of green, in frames and by the reference.
+    frames_ms : list of float
     """
-
-    seen_px: NDArray[np.float64]
-    exact_px: NDArray[np.float64]
-    mrad_per_px: NDArray[np.float64]
-    frames_ms: NDArray[np.float64]
-
-    @property
-    def error_px(self) -> float:
-        """Largest difference along x or y."""
-        return float(np.abs(self.seen_px - self.exact_px).max())
-
-    @property
-    def error_mrad(self) -> float:
-        """Largest distance between the centroids."""
-        apart_px = np.linalg.norm(self.seen_px - self.exact_px, axis=2).max(axis=1)
-        return float((apart_px * self.mrad_per_px).max())
-
-
-def lateral_color(profile, engine: str, truth: PointTruth, mode: str) -> LateralColor:
-    """Return the lateral color of points at `COLOR_PLACES_DEG`, in windows."""
-    seen_px, exact_px, mrad_per_px, frames_ms = [], [], [], []
+    errors_px, errors_mrad, frames_ms = [], [], []
     for eccentricity_deg, meridian_deg in COLOR_PLACES_DEG:
         away = math.tan(math.radians(eccentricity_deg))
         angle = math.radians(meridian_deg)
@@ -344,21 +265,23 @@ def lateral_color(profile, engine: str, truth: PointTruth, mode: str) -> Lateral
             away * math.cos(angle), away * math.sin(angle)
         )
         camera = camera_at(float(h_deg), float(v_deg), COLOR_PX)
-        x, y = (n // 2 for n in COLOR_PX)
         with opened(
-            profile, camera, engine, mode=mode, lateral_color=True
+            profile, camera, engine, mode="quality", lateral_color=True
         ) as eye_filter:
-            (frame,) = point_frames(
-                *(eye_filter, camera, [(x, y)], COLOR_STATE, truth),
-                reach_px=(COLOR_RADIUS_PX, COLOR_RADIUS_PX),
+            frame = point_frame(
+                *(eye_filter, camera, COLOR_STATE, truth),
+                reach_px=COLOR_RADIUS_PX,
                 is_gray=True,
             )
-            scale = wavefronts_of(eye_filter, camera, x, y, COLOR_STATE)[0]
-        for apart_px, is_exact in ((seen_px, False), (exact_px, True)):
-            centroids_px = frame.centroid_px(is_exact, COLOR_RADIUS_PX)
-            apart_px.append(centroids_px[[0, 2]] - centroids_px[1])
-        mrad_per_px.append(np.linalg.norm(np.linalg.inv(scale.pixel_from_mrad), ord=2))
+            middle = (n // 2 for n in COLOR_PX)
+            point = wavefronts_of(eye_filter, camera, *middle, COLOR_STATE)[0]
+        seen_px, exact_px = (
+            found[[0, 2]] - found[1]
+            for found in map(centroids_px, (frame.seen, frame.exact))
+        )
+        mrad_per_px = np.linalg.norm(np.linalg.inv(point.pixel_from_mrad), ord=2)
+        errors_px.append(np.abs(seen_px - exact_px).max())
+        apart_px = np.linalg.norm(seen_px - exact_px, axis=1).max()
+        errors_mrad.append(apart_px * mrad_per_px)
         frames_ms.append(frame.frame_ms)
-    return LateralColor(
-        *(np.array(v) for v in (seen_px, exact_px, mrad_per_px, frames_ms))
-    )
+    return float(max(errors_px)), float(max(errors_mrad)), frames_ms

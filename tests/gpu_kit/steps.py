@@ -112,9 +112,9 @@ def all_steps(tree: Path) -> tuple[Step, ...]:
         Step(
             "periphery",
             "merging that follows the gaze",
-            BENCHES + ".bench_periphery",
+            BENCHES,
             limit_s=20.0,
-            words=("--json", "--quick"),
+            words=("periphery", "--json", "--quick"),
         ),
         Step(
             "training",

@@ -1,4 +1,4 @@
-"""The memory that benchmarks report: of processes, and over changes of the eye."""
+"""The memory that benchmarks report: of processes."""
 
 import os
 import subprocess
@@ -7,7 +7,6 @@ import sys
 import pytest
 
 from tests.benchmarks.process_memory import (
-    ManyEyes,
     MemoryUse,
     process_ids,
     pss_mb,
@@ -31,9 +30,6 @@ def test_a_pss_that_is_not_available_is_not_a_number(tmp_path):
     partial = use(10.0, None)
     assert partial.total_mb is None
     assert "a 10, b not available" in partial.words
-    found = ManyEyes([use(10.0), partial, use(10.0)])
-    assert (found.largest_mb, found.growth_mb) == (None, None)
-    assert "second: not available" in found.words
 
 
 def test_processes_are_found_with_their_children():
@@ -44,10 +40,3 @@ def test_processes_are_found_with_their_children():
         child.communicate(b"\n")
     assert found["program"] == os.getpid()
     assert child.pid in found.values()
-
-
-def test_growth_compares_the_last_third_with_the_second():
-    totals = [900.0, 100.0, 200.0, 210.0, 205.0, 230.0]
-    found = ManyEyes.of(6, lambda k: use(totals[k], stores_mb=float(k)))
-    assert (found.largest_mb, found.growth_mb) == (900.0, 20.0)
-    assert "stores up to 5.0 MB" in found.words
