@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 
 from filter_service import Camera, EyeFilter, FilterSettings
-from tests.benchmarks.process_memory import process_ids, pss_mb
+from tests.process_memory import process_ids, pss_mb
 
 BATCH = 4
 THREADS_VARIABLE = "OCUFILTER_THREADS"

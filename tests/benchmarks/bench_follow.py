@@ -7,13 +7,14 @@ and a panned photograph (`stream_walks`), at 480x270 and 30 frames a second, and
 the service; half way the eye changes.  Then, with calls that wait: the slowest frame of
 the walk against the median, and how long the first frame after a step takes (pupil 3 to
 6 mm and focus 0 to 2.5 dpt at once).  Error: the share of whole frames.  The setting
-also states the memory of stores, tables and buffers, and the PSS of every process; the
-process "program" includes the benchmark, its images and modules.
+also states the memory of kernels and tables of PSFs.
 """
 
 import math
+import socket
 import sys
 import time
+import urllib.request
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -27,7 +28,6 @@ from filter_service.filtering.builder import Builder
 from filter_service.filtering.stream_eyes import EyeReady
 from filter_service.rendering.native.renderer import NativeLanes
 from tests.benchmarks.harness import Row, Run
-from tests.benchmarks.process_memory import MemoryUse, free_port
 from tests.benchmarks.published_figures import CONDITIONS
 from tests.benchmarks.rows import row_of
 from tests.benchmarks.stream_walks import Moment, demo_walk, photograph_walk
@@ -56,15 +56,16 @@ class Seen:
     n_dropped: int = 0
     times_ms: list[float] = field(default_factory=list)
     new_eye_s: float = math.inf
-    memory: MemoryUse | None = None
+    kernels_mb: float = 0.0
+    tables_mb: float = 0.0
 
     @property
     def words(self) -> str:
         """Return the counts and the memory in words."""
-        told = "" if self.memory is None else f", {self.memory.words}"
         return (
             f"{self.n_dropped} of {self.n_frames} dropped, new eye after "
-            f"{self.new_eye_s:.2f} s{told}"
+            f"{self.new_eye_s:.2f} s, kernels {self.kernels_mb:.0f} MB, "
+            f"tables {self.tables_mb:.0f} MB"
         )
 
 
@@ -132,8 +133,25 @@ class Following:
             seen.n_whole += is_whole and end_s - due_s <= 2.0 / rate_hz
             if is_whole and shown.generation > 1:
                 seen.new_eye_s = min(seen.new_eye_s, end_s - changed_s)
-        seen.memory = MemoryUse.of_builder(self.builder)
+        seen.kernels_mb = self.builder.stores_mb
+        seen.tables_mb = self.builder.tables_mb
         return seen
+
+
+def service_memory_mb(metrics_port: int) -> list[float]:
+    """Return the memory of kernels and of tables, by the metrics of a service."""
+    url = f"http://127.0.0.1:{metrics_port}/metrics"
+    with urllib.request.urlopen(url, timeout=10.0) as reply:
+        lines = reply.read().decode().splitlines()
+    values = dict(line.rsplit(" ", 1) for line in lines if not line.startswith("#"))
+    return [float(values[f"ocufilter_{n}_bytes"]) / 1e6 for n in ("psfs", "psf_tables")]
+
+
+def free_port() -> int:
+    """Return a port that is free now."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
 
 
 def served(
@@ -184,7 +202,7 @@ def served(
         end_s = time.monotonic() + 2.0
         while client.n_unanswered and time.monotonic() < end_s:
             take(client.poll(0.01))
-        seen.memory = MemoryUse.of_service(service, port)
+        seen.kernels_mb, seen.tables_mb = service_memory_mb(port)
     return seen
 
 

@@ -1,4 +1,4 @@
-"""How true frames are: points of light, energy, color, continuity, edges, crops.
+"""How true frames are: points of light, energy, continuity, edges.
 
 The reference of points is `tests.reference.point_image`: quadrature of the wavefront of
 exactly the pixel's direction, distance and state.  Frames have the tolerance 0 unless a
@@ -10,16 +10,12 @@ row says otherwise.
   gray, they are not, and frames are divided by their coverage, so that a uniform image
   stays uniform.
 - energy: largest difference of a point's light in the frame from 1.
-- color: the setting lateral_color; largest difference between the centroids of red or
-  blue minus green in frames and in the reference, 5 to 20 degrees from the axis.
 - continuity: least ratio of the changes of a frame while the change of its input is
   halved, down to changes of light of 1e-4; 2 if frames are continuous.
 - edge: largest difference of a lamp's light in a frame, 1 to 6 px beside a black edge
   in focus, from the share of its image that does not fall on the nearer surface, in
   green, for which the edge is in focus; and from the share of the pupil's rays to the
   lamp that pass the edge, in all colors and also where the edge is not sharp.
-- crop: PSNR of a camera's window, at an odd place, against the full frame, of linear
-  light, away from the border.
 """
 
 from collections.abc import Iterator
@@ -28,7 +24,6 @@ import numpy as np
 
 from filter_service.filtering.eye_filter import EyeFilter
 from tests.benchmarks import truth_changes, truth_edges
-from tests.benchmarks.engines import ENGINES
 from tests.benchmarks.harness import Row, Run
 from tests.benchmarks.published_figures import CONDITIONS
 from tests.benchmarks.rows import row_of
@@ -38,12 +33,11 @@ from tests.benchmarks.truth_points import (
     WINDOW_PX,
     PointTruth,
     camera_at,
-    lateral_color,
     opened,
     point_frame,
 )
 
-MINUTES = 45
+MINUTES = 35
 METHODS = {
     # method: settings, goal of the image of a point
     "on-axis": ({"mode": "on-axis"}, 0.01),
@@ -51,15 +45,9 @@ METHODS = {
     "quality": ({"mode": "quality"}, 0.015),
     "quality fine": ({"mode": "quality", "tolerance": "fine"}, 0.005),
 }
-ENERGY_GOAL, COLOR_GOAL, RATIO_GOAL, EDGE_GOAL = 0.002, 0.02, 1.8, 0.02
-CROP_GOAL_DB = 60.0
-COLOR_EYES = {
-    "emmetropia": "emmetropia",
-    "escudero_sanz": {"kind": "published", "name": "escudero_sanz_navarro_1999"},
-    "myopia": "myopia",
-}
+ENERGY_GOAL, RATIO_GOAL, EDGE_GOAL = 0.002, 1.8, 0.02
 REFERENCE = "float64 quadrature"
-ENGINE = ENGINES[0]
+ENGINE = "native"
 
 
 def _row(method, case, setting, error_name, error, reference, times_ms=()) -> Row:
@@ -107,16 +95,6 @@ def point_rows(truth: PointTruth, eye: str, methods, n_places: int) -> Iterator[
                 )
 
 
-def color_rows(truth: PointTruth, eye: str, engine: str) -> Iterator[Row]:
-    """Yield the lateral color of frames."""
-    error_px, error_mrad, frames_ms = lateral_color(COLOR_EYES[eye], engine, truth)
-    for unit, error in (("px", error_px), ("mrad", error_mrad)):
-        yield _row(
-            *(f"color, {engine}", eye, "quality, 3 mm", f"color, largest, {unit}"),
-            *(error, f"{REFERENCE}; goal {COLOR_GOAL:g}", frames_ms),
-        )
-
-
 def change_rows(eye: str, picture: str, inputs) -> Iterator[Row]:
     """Yield the continuity of frames."""
     view = truth_changes.views()[picture]
@@ -149,34 +127,18 @@ def edge_rows(truth: PointTruth, eye: str) -> Iterator[Row]:
             )
 
 
-def crop_rows(eye: str, mode: str) -> Iterator[Row]:
-    """Yield the error of windows of frames against full frames."""
-    for tolerance, error_db in truth_edges.crop_errors_db(
-        eye, ENGINE, mode=mode
-    ).items():
-        yield _row(
-            *(f"crop, {mode}", eye, f"tolerance {tolerance:g}", "crop, dB", error_db),
-            f"full frame; goal {CROP_GOAL_DB:g}",
-        )
-
-
 def measure(run: Run) -> list[Row]:
     """Return the rows of all parts."""
     truth, rows = PointTruth(), []
     with EyeFilter(engine=ENGINE):  # keeps the build worker of all others
         if run.is_quick:
             rows += point_rows(truth, "emmetropia", ("on-axis",), 1)
-            rows += crop_rows("emmetropia", "dynamic")
+            rows += change_rows("emmetropia", "courtyard", ("pupil",))
             return rows
         for eye in CONDITIONS:
             rows += point_rows(truth, eye, METHODS, len(PLACES_DEG))
             for picture in ("courtyard", "photograph"):
                 rows += change_rows(eye, picture, tuple(truth_changes.STEPS))
-            for mode in ("on-axis", "dynamic", "quality"):
-                rows += crop_rows(eye, mode)
-        for eye in COLOR_EYES:
-            for engine in ENGINES:
-                rows += color_rows(truth, eye, engine)
         for eye in truth_edges.EDGES_DPT:
             rows += edge_rows(truth, eye)
     return rows

@@ -1,15 +1,10 @@
-"""Lamps beside edges, and windows of frames, for `bench_truth`."""
+"""Lamps beside edges, for `bench_truth`."""
 
 import math
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from filter_service.camera import Camera
-from filter_service.rendering.media_effects import linear_from_srgb
-from filter_service.rgbd_view import RgbdView
-from tests.benchmarks.photograph import motorcycle
 from tests.benchmarks.truth_points import (
     PITCH_MRAD,
     PointState,
@@ -130,76 +125,3 @@ def _visible_shares(
             [float(np.mean(x_px + 0.5 + moved_px > EDGE_X_PX)) for x_px in lamps_px]
         )
     return 1.0 - np.transpose(hidden), np.transpose(passing)
-
-
-CROP_FULL_PX, CROP_PX, CROP_AT_PX = (361, 241), (223, 163), (67, 35)
-"""Size of a full frame, and size and place of a window in it."""
-
-CROP_STATE = PointState(4.3, 0.5, 0.5)
-
-
-def crop_errors_db(
-    eye_name: str, engine: str, *, mode: str, tolerances: tuple[float, ...] = (0.0, 1.0)
-) -> dict[float, float]:
-    """Return the PSNR of a window against the same part of the full frame.
-
-    Pixels nearer to the border of the window than light reaches are left out.  Linear
-    light, with 1 as its peak; by tolerance.
-    """
-    full = camera_at(0.0, 0.0, CROP_FULL_PX)
-    view = picture(full)
-    (x, y), (width, height) = CROP_AT_PX, CROP_PX
-    left, right, up, down = full.tangents
-    across = (right - left) / full.width_px, (up - down) / full.height_px
-    window = Camera(
-        width,
-        height,
-        (
-            *(left + across[0] * x, left + across[0] * (x + width)),
-            *(up - across[1] * y, up - across[1] * (y + height)),
-        ),
-    )
-    part = slice(y, y + height), slice(x, x + width)
-    seen: dict[float, list[np.ndarray]] = {tolerance: [] for tolerance in tolerances}
-    for camera, place in ((full, (slice(None), slice(None))), (window, part)):
-        with opened(eye_name, camera, engine, mode=mode) as eye_filter:
-            for tolerance, colors in seen.items():
-                found = filtered(
-                    *(eye_filter, np.ascontiguousarray(view.color[place])),
-                    *(np.ascontiguousarray(view.depth_m[place]), camera, CROP_STATE),
-                    render_tolerance=tolerance,
-                )
-                colors.append(found.color.astype(np.float64))
-            reach_px = max(
-                point.spot_px() + EDGE_REACH_PX
-                for object_dpt in (1.0 / view.depth_m.max(), 1.0 / view.depth_m.min())
-                for point in wavefronts_of(
-                    *(eye_filter, camera, width // 2, height // 2),
-                    replace(CROP_STATE, object_dpt=float(object_dpt)),
-                )
-            )
-    border = math.ceil(reach_px)
-    if 2 * border >= min(width, height):
-        raise ValueError(f"light reaches {border} px: the window has none left")
-    inner = slice(border, height - border), slice(border, width - border)
-    return {
-        tolerance: -10.0
-        * math.log10(max(float(np.mean((whole[part] - own)[inner] ** 2)), 1e-30))
-        for tolerance, (whole, own) in seen.items()
-    }
-
-
-EDGE_REACH_PX = 12.0
-"""Distance from the rays at which kernels of 99 % of the light have ended."""
-
-
-def picture(camera: Camera) -> RgbdView:
-    """Return a photograph with depth in linear light, in a camera's view."""
-    size = camera.width_px, camera.height_px
-    color, depth_m = motorcycle(2 * size[0], 2 * size[1])
-    color, depth_m = (
-        np.ascontiguousarray(image[: 2 * size[1] : 2, : 2 * size[0] : 2])
-        for image in (color, depth_m)
-    )
-    light = linear_from_srgb(color).astype(np.float32)
-    return RgbdView(light, depth_m, camera.tangents, "radial")

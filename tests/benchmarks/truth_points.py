@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.field.eye_optics import EyeOptics
-from estimator.optics import pinhole
 from filter_service.camera import Camera
 from filter_service.filtering.eye_filter import EyeFilter
 from filter_service.given_profile import as_profile
@@ -181,13 +180,6 @@ class PointFrame:
         return np.abs(self.seen - self.exact).sum(axis=(0, 1)) / 2.0
 
 
-def centroids_px(light: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the centroids x, y (3, 2) from the middle; y is downward."""
-    y, x = (np.arange(n) - n // 2 for n in light.shape[:2])
-    moments = [np.einsum("yxc,x->c", light, x), np.einsum("yxc,y->c", light, y)]
-    return np.stack(moments, axis=1) / light.sum(axis=(0, 1))[:, None]
-
-
 @contextmanager
 def opened(profile, camera: Camera, engine: str, **settings) -> Iterator[EyeFilter]:
     """Open a filter of a profile without scattered light, which is not in PSFs."""
@@ -233,55 +225,3 @@ def point_frame(
     exact = np.stack([placed(image, x, y, size) for image in images], axis=-1)
     part = tuple(slice(max(at - reach_px, 0), at + reach_px + 1) for at in (y, x))
     return PointFrame(light[part], exact[part], light.sum(axis=(0, 1)), frame_ms)
-
-
-COLOR_PLACES_DEG = (
-    *((5.0, 0.0), (5.0, 160.0), (10.0, 75.0), (10.0, 255.0)),
-    *((15.0, 0.0), (15.0, 160.0), (20.0, 75.0), (20.0, 255.0)),
-)
-"""Eccentricities and meridians."""
-
-COLOR_PX, COLOR_RADIUS_PX = (81, 81), 30
-COLOR_STATE = PointState(3.0, 0.5, 0.5)
-
-
-def lateral_color(
-    profile, engine: str, truth: PointTruth
-) -> tuple[float, float, list[float]]:
-    """Compare the lateral color of points at `COLOR_PLACES_DEG`, in windows.
-
-    Returns
-    -------
-    error_px, error_mrad : float
-        Largest difference, along x or y and as a distance, between the centroids of red
-        or blue minus that of green, in frames and by the reference.
-    frames_ms : list of float
-    """
-    errors_px, errors_mrad, frames_ms = [], [], []
-    for eccentricity_deg, meridian_deg in COLOR_PLACES_DEG:
-        away = math.tan(math.radians(eccentricity_deg))
-        angle = math.radians(meridian_deg)
-        h_deg, v_deg = pinhole.direction_deg(
-            away * math.cos(angle), away * math.sin(angle)
-        )
-        camera = camera_at(float(h_deg), float(v_deg), COLOR_PX)
-        with opened(
-            profile, camera, engine, mode="quality", lateral_color=True
-        ) as eye_filter:
-            frame = point_frame(
-                *(eye_filter, camera, COLOR_STATE, truth),
-                reach_px=COLOR_RADIUS_PX,
-                is_gray=True,
-            )
-            middle = (n // 2 for n in COLOR_PX)
-            point = wavefronts_of(eye_filter, camera, *middle, COLOR_STATE)[0]
-        seen_px, exact_px = (
-            found[[0, 2]] - found[1]
-            for found in map(centroids_px, (frame.seen, frame.exact))
-        )
-        mrad_per_px = np.linalg.norm(np.linalg.inv(point.pixel_from_mrad), ord=2)
-        errors_px.append(np.abs(seen_px - exact_px).max())
-        apart_px = np.linalg.norm(seen_px - exact_px, axis=1).max()
-        errors_mrad.append(apart_px * mrad_per_px)
-        frames_ms.append(frame.frame_ms)
-    return float(max(errors_px)), float(max(errors_mrad)), frames_ms

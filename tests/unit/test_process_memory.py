@@ -6,17 +6,12 @@ import sys
 
 import pytest
 
-from tests.benchmarks.process_memory import (
-    MemoryUse,
+from tests.process_memory import (
     process_ids,
     pss_mb,
 )
 
 pytestmark = pytest.mark.tools
-
-
-def use(*pss, stores_mb=1.0):
-    return MemoryUse(stores_mb, 2.0, 3.0, dict(zip("abc", pss, strict=False)))
 
 
 def test_the_pss_is_what_the_kernel_reports(tmp_path):
@@ -27,9 +22,6 @@ def test_the_pss_is_what_the_kernel_reports(tmp_path):
 
 def test_a_pss_that_is_not_available_is_not_a_number(tmp_path):
     assert pss_mb(1, str(tmp_path / "missing")) is None
-    partial = use(10.0, None)
-    assert partial.total_mb is None
-    assert "a 10, b not available" in partial.words
 
 
 def test_processes_are_found_with_their_children():
