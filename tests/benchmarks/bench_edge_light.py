@@ -13,17 +13,18 @@ from unittest import mock
 import numpy as np
 
 from estimator.profiles.parse import parse_profile
+from filter_service.gl.gpu import Gpu
 from filter_service.planning.plan import plan_cache
 from filter_service.psfs.eye_for_spec import eye_for_spec
 from filter_service.psfs.store import PsfStore, build_psf_store
 from filter_service.rendering import edge_kinds, edge_light
 from filter_service.rendering.edge_light import EdgeLight
 from filter_service.rendering.engine import ViewRequest
+from filter_service.rendering.gl import FilterRenderer
 from filter_service.rendering.media_effects import begin_through_media
 from filter_service.rendering.native import NativeRenderer
 from filter_service.rgbd_view import RgbdView
 from filter_service.view_state import State
-from tests.benchmarks.engines import ENGINES, open_renderer
 from tests.benchmarks.frame_runs import states_towards
 from tests.benchmarks.harness import Row, Run
 from tests.benchmarks.rows import row_of
@@ -33,6 +34,7 @@ from tests.numerical.synthetic import tangents
 from tests.reference.edge_light import lamp_light, ring_ratios
 
 MINUTES = 8
+ENGINES = {"native": NativeRenderer, "gl": lambda: FilterRenderer(Gpu())}
 LAMP, RADIUS_PX, PITCH_MRAD = 1000.0, 100, 0.7
 EMMETROPE = {
     "kind": "prescription",
@@ -143,7 +145,7 @@ def exact_limits():
     ]
 
 
-def frame_rows(size: tuple[int, int], count: int, engines=ENGINES):
+def frame_rows(size: tuple[int, int], count: int, engines=("native", "gl")):
     """Added time of frames, and the error of limited numbers of sources and kernels."""
     view, colors = scenes(size)
     spec = grid_spec(
@@ -159,7 +161,7 @@ def frame_rows(size: tuple[int, int], count: int, engines=ENGINES):
     states = states_towards(spec, 4.5, 0.5, count)
     without = mock.patch.object(EdgeLight, "of", return_value=None)
     for engine_name in engines:
-        engine = open_renderer(engine_name)
+        engine = ENGINES[engine_name]()
         handle = engine.load(store)
 
         def frame(color, state, output="srgb8", engine=engine, handle=handle):
@@ -216,5 +218,5 @@ def limited_error(frame, without, color, state) -> float:
 def measure(run: Run) -> list[Row]:
     """Return the rows of lamps and frames."""
     if run.is_quick:
-        return [*lamp_rows(30), *frame_rows((160, 90), 2, ENGINES[:1])]
+        return [*lamp_rows(30), *frame_rows((160, 90), 2, ("native",))]
     return [*lamp_rows(RADIUS_PX), *frame_rows((1280, 720), 12)]

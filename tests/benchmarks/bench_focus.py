@@ -3,7 +3,6 @@
 Every eye is asked, as a frame asks it, to look at distances through pupils of 2 to 7
 mm.  Rays from points at many distances then run inwards to the retina: error is how far
 the distance of the smallest RMS wavefront lies from the focus that the eye reported.
-Far points are those of both eye models.
 """
 
 import time
@@ -13,7 +12,6 @@ import numpy as np
 from estimator.estimate.estimation import EstimatedEye, estimate_eye
 from estimator.field.traced_eye import TracedEye
 from estimator.optics.units import RGB_WAVELENGTHS_NM
-from estimator.profiles.measured_wavefront import MeasuredWavefront
 from estimator.profiles.parse import EyeProfile, parse_profile, preset_names
 from tests.benchmarks.forward_rays import WAVELENGTH_NM, ForwardEye
 from tests.benchmarks.harness import Row, Run
@@ -88,29 +86,6 @@ def focus_rows(name: str, profile: EyeProfile, pupils_mm, foci_dpt) -> list[Row]
     return rows
 
 
-def far_point_rows(name: str, profile: EyeProfile) -> list[Row]:
-    """Far points of both models and by forward rays, at 3 mm and the measured pupil."""
-    estimated, measured = estimate_eye(profile), MeasuredWavefront(profile)
-    rows = []
-    for pupil_mm in sorted({3.0, profile.pupil_diameter_mm}):
-        far_dpt, _ = estimated.accommodating.focus_limits_dpt(pupil_mm)
-        other_dpt, _ = measured.focus_limits_dpt(pupil_mm)
-        surfaces = estimated.accommodating.states_at([0.0])[0].surfaces
-        forward = ForwardEye.of(
-            surfaces,
-            pupil_diameter_mm=pupil_mm,
-            rest_um=estimated.rest(WAVELENGTH_NM).on_axis_um(pupil_mm)[0],
-        )
-        setting = f"far point {far_dpt:.3f} dpt at {pupil_mm:g} mm"
-        for method, against_dpt in (
-            ("measured wavefront", other_dpt),
-            ("forward rays", forward.sharpest_dpt(far_dpt)),
-        ):
-            error_dpt = against_dpt - far_dpt
-            rows.append(_row(method, name, setting, [], "far point, dpt", error_dpt))
-    return rows
-
-
 def summary_rows(rows: list[Row]) -> list[Row]:
     """Largest and median error of each method over all eyes."""
     found = []
@@ -130,5 +105,5 @@ def measure(run: Run) -> list[Row]:
     rows = []
     for name, profile in [*profiles().items()][: 1 if run.is_quick else None]:
         asked = ((4.0,), (1.5,)) if run.is_quick else (PUPILS_MM, FOCI_DPT)
-        rows += focus_rows(name, profile, *asked) + far_point_rows(name, profile)
+        rows += focus_rows(name, profile, *asked)
     return summary_rows(rows) + rows

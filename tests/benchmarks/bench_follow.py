@@ -99,8 +99,7 @@ class Following:
         begin_s = time.perf_counter()
         self.filter.filter(
             moment.view,
-            pupil_diameter_mm=moment.pupil_diameter_mm,
-            focus_dpt=moment.focus_dpt,
+            **moment.state,
         )
         return 1e3 * (time.perf_counter() - begin_s)
 
@@ -124,8 +123,7 @@ class Following:
             begin_s = time.perf_counter()
             shown = self.filter.try_filter(
                 [moment.view],
-                pupil_diameter_mm=moment.pupil_diameter_mm,
-                focus_dpt=moment.focus_dpt,
+                **moment.state,
             )
             seen.times_ms.append(1e3 * (time.perf_counter() - begin_s))
             end_s = time.monotonic()
@@ -195,8 +193,7 @@ def served(
                 continue
             frame_id = client.submit(
                 moment.view,
-                pupil_diameter_mm=moment.pupil_diameter_mm,
-                focus_dpt=moment.focus_dpt,
+                **moment.state,
             )
             sent_s[frame_id] = due_s
         end_s = time.monotonic() + 2.0

@@ -13,36 +13,40 @@ of the whole takes tens of minutes.  References are kept under out/dense_referen
 """
 
 import sys
+import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from clients.pyrender_stream import path_settings
+from filter_service.gl.gpu import Gpu
 from filter_service.gl_device import is_software_renderer
 from filter_service.psfs.store import build_psf_store
+from filter_service.rendering.gl.renderer import FilterRenderer
 from filter_service.rendering.native import NativeRenderer
-from tests.benchmarks.engines import open_renderer
+from tests.benchmarks.dense_reference import dense_reference
 from tests.benchmarks.harness import RESULTS, Row, Run
-from tests.benchmarks.live_walk import (
-    SCENE,
-    WHOLE_PIXELS,
-    WINDOW_PX,
-    Judge,
-    Walk,
-    judged_windows,
-    walk_times,
-)
 from tests.benchmarks.published_figures import CONDITIONS
 from tests.benchmarks.rows import row_of
+from tests.benchmarks.stream_walks import Moment, courtyard_walk
+from tests.benchmarks.view_sources import EyeState, Window
 from tests.grid_specs import grid_spec
 from tests.numerical.plan_cases import traced_eye
+from tests.numerical.synthetic import psnr_db
 
 MINUTES = 90
 SIZES = ((480, 270), (1280, 720))
+PATH = path_settings("courtyard")
+WARM_UPS = 2
 SOFTWARE_GL_FRAMES = 3
 """Of the walk, where OpenGL is the processor's work."""
 
+WHOLE_PIXELS = 640 * 360
+"""Largest frame that is judged as a whole."""
 
+WINDOW_PX = 256
 STAGES = {  # of the picture: those of the engines
     "plan of kernels": ("psf_plan",),
     "kernels": ("psf_blend", "upload"),
@@ -53,58 +57,93 @@ STAGES = {  # of the picture: those of the engines
 }
 
 
-@dataclass(frozen=True)
-class Way:
-    """One way to filter a walk."""
+def judged_windows(width_px: int, height_px: int) -> list[Window]:
+    """Return the parts of a frame whose error is measured."""
+    if width_px * height_px <= WHOLE_PIXELS:
+        return [Window(0, 0, width_px, height_px)]
+    right, bottom = width_px - WINDOW_PX, height_px - WINDOW_PX
+    places = ((right // 2, bottom // 2), (0, bottom // 2), (right, bottom))
+    return [Window(*place, WINDOW_PX, WINDOW_PX) for place in places]
 
-    name: str
-    renderer: object
-    tolerance: float = 1.0
-    frame_count: int | None = None
+
+def exact_pixels(moment: Moment, eye: str, windows: Sequence[Window]) -> NDArray:
+    """Return the pixels (n, 3) of windows through the exact PSF of each."""
+    camera = moment.view.camera
+    spec = grid_spec(
+        camera,
+        mode="quality",
+        pupil_range_mm=(moment.pupil_diameter_mm,) * 2,
+        focus_range_dpt=(moment.focus_dpt,) * 2,
+        object_range_dpt=PATH["object_range_dpt"],
+    )
+    state = EyeState(traced_eye(eye, spec), spec, *moment.state.values())
+    whole = Window(0, 0, camera.width_px, camera.height_px)
+    return np.concatenate(
+        [
+            dense_reference(
+                moment.view, state, bins=True, window=None if w == whole else w
+            ).reshape(-1, 3)
+            for w in windows
+        ]
+    )
 
 
-def ways_of(gl) -> Iterator[Way]:
-    """Yield OpenGL, if it is there, and the native engine on one and two cores."""
+def ways(gl) -> Iterator[tuple[str, object, float, int | None]]:
+    """Yield names, renderers, tolerances and numbers of frames.
+
+    They are OpenGL, if it is there, and the native engine on one and two cores.
+    """
     if gl is not None:
         few = SOFTWARE_GL_FRAMES if is_software_renderer(gl.name) else None
-        yield Way("GL", gl, frame_count=few)
-    for n_threads in (1, 2):
-        cores = f"{n_threads} core" + "s" * (n_threads > 1)
+        yield "GL", gl, 1.0, few
+    for n_threads, name in ((1, "1 core"), (2, "2 cores")):
         renderer = NativeRenderer(n_threads=n_threads)
-        yield Way(cores, renderer)
-        if n_threads == 2:
-            for tolerance in (1.4, 2.0):
-                yield Way(f"{cores}, tolerance {tolerance:g}", renderer, tolerance)
+        yield name, renderer, 1.0, None
+        for tolerance in (1.4, 2.0) if n_threads == 2 else ():
+            yield f"{name}, tolerance {tolerance:g}", renderer, tolerance, None
         renderer.close()
 
 
-def eye_rows(eye: str, walk: Walk, gl) -> list[Row]:
+def eye_rows(eye: str, walk: Sequence[Moment], gl) -> list[Row]:
     """Return the rows of one eye and size, each way and its stages."""
-    judge = Judge.of(walk, eye, compute=True)
-    spec = grid_spec(**walk.camera, mode="dynamic", **path_settings(SCENE))
+    judged, camera = walk[len(walk) // 2], walk[0].view.camera
+    windows = judged_windows(camera.width_px, camera.height_px)
+    truth = exact_pixels(judged, eye, windows)
+    spec = grid_spec(camera, mode="dynamic", **PATH)
     store = build_psf_store(traced_eye(eye, spec), spec)
     reference = "dense, over the field, bins of 0.2 deg and 0.005 dpt"
-    if judged_windows(walk.size_px) != [None]:
+    if len(windows) > 1:
         reference += f", three windows of {WINDOW_PX} x {WINDOW_PX} px"
     rows: list[Row] = []
-    for way in ways_of(gl):
-        handle = way.renderer.load(store)
-        error_db = judge.error_db(way.renderer, handle, way.tolerance)
-        of_way = walk.shortened(way.frame_count)
-        times_ms, stages_ms = walk_times(way.renderer, handle, of_way, way.tolerance)
-        parts = {f"  {k.removesuffix('_ms')}": [v] for k, v in stages_ms.items()}
+    for name, renderer, tolerance, count in ways(gl):
+        handle = renderer.load(store)
+
+        def frame(
+            moment, output, renderer=renderer, handle=handle, tolerance=tolerance
+        ):
+            options = moment.state | {"output": output, "render_tolerance": tolerance}
+            return renderer.render(moment.view, handle, **options)
+
+        seen = frame(judged, "linear").color
+        error_db = psnr_db(
+            np.concatenate([w.of(seen).reshape(-1, 3) for w in windows]), truth
+        )
+        times_ms: dict[str, list[float]] = {"frame": []}
+        for moment in walk[:WARM_UPS]:
+            frame(moment, "srgb8")
+        for number, moment in enumerate(walk[:count]):
+            start_s = time.perf_counter()
+            stages_ms = frame(moment, "srgb8").stage_times_ms
+            times_ms["frame"].append(1e3 * (time.perf_counter() - start_s))
+            for stage, stage_ms in stages_ms.items():
+                own = times_ms.setdefault(f"  {stage.removesuffix('_ms')}", [])
+                own += [0.0] * (number - len(own)) + [stage_ms]
+        setting = f"{camera.width_px}x{camera.height_px} {name}"
         rows += [
             row_of(
-                *(
-                    "live",
-                    method,
-                    eye,
-                    f"{walk.size_px[0]}x{walk.size_px[1]} {way.name}",
-                ),
-                *(own_ms, "psnr_db", error_db, reference),
-                n=len(times_ms),
+                *("live", method, eye, setting, own_ms, "psnr_db", error_db, reference)
             )
-            for method, own_ms in {"frame": times_ms, **parts}.items()
+            for method, own_ms in times_ms.items()
         ]
     return rows
 
@@ -157,10 +196,9 @@ def _plot_way(axes, rows: Sequence[Row]) -> None:
 def measure(run: Run) -> list[Row]:
     """Return the rows of all eyes and sizes, or of a small one."""
     rows: list[Row] = []
-    gl = None if run.is_quick else open_renderer("gl")
+    gl = None if run.is_quick else FilterRenderer(Gpu())
     for size_px in ((96, 54),) if run.is_quick else SIZES:
-        count = 24 if size_px[0] * size_px[1] <= WHOLE_PIXELS else 12
-        walk = Walk.of(size_px, count)
+        walk = courtyard_walk(size_px, 24 if size_px[0] <= 640 else 12)
         for eye in CONDITIONS[: 1 if run.is_quick else None]:
             rows += eye_rows(eye, walk, gl)
             print(f"{size_px} {eye}", file=sys.stderr, flush=True)

@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from filter_service.rendering.media_effects import srgb_from_linear
+from filter_service.rendering.native import NativeRenderer
 from tests.benchmarks.dense_reference import dense_reference
-from tests.benchmarks.engines import open_renderer
 from tests.benchmarks.field_methods import METHODS, EyeBench, State
-from tests.benchmarks.harness import OUT, RESULTS, Row, Run, memory_mb
+from tests.benchmarks.harness import OUT, Row, Run, memory_mb, written_path
 from tests.benchmarks.image_measures import channel_psnr_db
 from tests.benchmarks.view_sources import Window
 from tests.numerical.scene_frames import scene_view
@@ -193,9 +193,9 @@ def _save(page: Image.Image, out: Path, number: int) -> None:
 def measure(run: Run) -> tuple[list[Row], dict[str, list[dict]]]:
     """Return rows, and the size and state of the frames; write the pictures."""
     size = QUICK_SIZE if run.is_quick else SIZE
-    out = OUT / "paper" if run.is_quick else RESULTS
+    out = OUT / "paper" if run.is_quick else written_path(".")
     out.mkdir(parents=True, exist_ok=True)
-    renderer = open_renderer()
+    renderer = NativeRenderer()
     _save(sheet(first_figure(renderer, size), (640, 360)), out, 1)
     rows: list[Row] = [
         row

@@ -99,13 +99,6 @@ def dense_reference(
     return np.load(path)
 
 
-def has_reference(
-    view: RgbdView, state: EyeState, *, bins: bool, window: Window | None = None
-) -> bool:
-    """Whether a reference of the usual rule has been computed and kept."""
-    return _path(view, state, bins, "coverage", window).exists()
-
-
 def _path(
     view: RgbdView,
     state: EyeState,

@@ -152,7 +152,7 @@ class Ours(Method):
     def run(self, bench: EyeBench, view: RgbdView, state: State, repeats: int) -> list:
         """Filter ``repeats`` times after a warm-up; list of `Filtered`."""
         handle, build_ms = bench.store(self, state)
-        run = timed_frames(
+        frames, times_ms = timed_frames(
             bench.renderer,
             view,
             handle,
@@ -168,7 +168,7 @@ class Ours(Method):
                 memory_mb=handle.store.memory_mb,
                 psf_count=handle.store.psf_count,
             )
-            for frame, time_ms in zip(run.frames, run.times_ms, strict=True)
+            for frame, time_ms in zip(frames, times_ms, strict=True)
         ]
 
 

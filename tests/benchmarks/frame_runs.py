@@ -1,16 +1,12 @@
-"""Timed frames of a renderer, in a state that changes with every frame or stays.
+"""Timed frames of a renderer in a state that changes with every frame.
 
 In a stream pupil and focus change all the time, so a frame's kernels are blended anew;
 that is what `timed_frames` measures.  Its states come ever nearer to the one that is
 asked for and end there, no two alike, so that the last picture can be judged by the
-reference of that very state.  A state that stays ("frozen") leaves each frame the
-kernels of the one before.
+reference of that very state.
 """
 
 import time
-from dataclasses import dataclass
-
-import numpy as np
 
 from filter_service.planning.grid import GridSpec
 
@@ -18,36 +14,6 @@ CHANGE = 1e-3
 """Of pupil (mm), focus (dpt) and gaze (degrees) over a run: too little to be seen."""
 
 WARM_UPS = 1
-
-
-@dataclass(frozen=True)
-class FrameRun:
-    """Frames after the warm-up, and the wall time of each.
-
-    Attributes
-    ----------
-    frames : list of ViewResult
-        The last is of the very state that was asked for.
-    times_ms : (n,)
-    """
-
-    frames: list
-    times_ms: list[float]
-
-    @property
-    def last(self):
-        """The frame to judge."""
-        return self.frames[-1]
-
-    @property
-    def median_ms(self) -> float:
-        """Median time."""
-        return float(np.median(self.times_ms))
-
-    @property
-    def p95_ms(self) -> float:
-        """95th percentile of the times."""
-        return float(np.percentile(self.times_ms, 95))
 
 
 def timed_frames(
@@ -58,21 +24,20 @@ def timed_frames(
     pupil_diameter_mm: float,
     focus_dpt: float,
     repeats: int,
-    frozen: bool = False,
     **options,
-) -> FrameRun:
-    """Render a view after a warm-up; ``options`` are those of `render`."""
-    count = WARM_UPS + repeats
-    states = states_towards(
-        handle.store.spec, pupil_diameter_mm, focus_dpt, 1 if frozen else count
-    )
-    states = states * count if frozen else states
+) -> tuple[list, list[float]]:
+    """Render a view after a warm-up; return the frames and their times in ms.
+
+    The last frame is of the requested state.  ``options`` are those of `render`.
+    """
     frames, times_ms = [], []
-    for state in states:
+    for state in states_towards(
+        handle.store.spec, pupil_diameter_mm, focus_dpt, WARM_UPS + repeats
+    ):
         start_s = time.perf_counter()
         frames.append(renderer.render(view, handle, **state, **options))
         times_ms.append(1e3 * (time.perf_counter() - start_s))
-    return FrameRun(frames[WARM_UPS:], times_ms[WARM_UPS:])
+    return frames[WARM_UPS:], times_ms[WARM_UPS:]
 
 
 def states_towards(

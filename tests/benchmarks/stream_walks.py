@@ -6,9 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from clients.scene_renderer import PATHS, path_moments
 from filter_service.camera import Camera
 from filter_service.rgbd_view import RgbdView
 from tests.benchmarks.photograph import motorcycle
+from tests.numerical.scene_frames import scene_views
 
 FOV_DEG = 50.0
 PUPIL_MM, PUPIL_PERIOD_S = (2.9, 5.5), 6.0
@@ -24,6 +26,14 @@ class Moment:
     view: RgbdView
     pupil_diameter_mm: float
     focus_dpt: float
+
+    @property
+    def state(self) -> dict[str, float]:
+        """Arguments of a frame."""
+        return {
+            "pupil_diameter_mm": self.pupil_diameter_mm,
+            "focus_dpt": self.focus_dpt,
+        }
 
 
 def _between(span: tuple[float, float], at_s: float, period_s: float) -> float:
@@ -66,10 +76,19 @@ def photograph_walk(
     return moments
 
 
+def courtyard_walk(size_px: tuple[int, int], count: int) -> list[Moment]:
+    """Return the demo's walk through the courtyard in so many frames."""
+    views = scene_views(
+        "courtyard", width_px=size_px[0], height_px=size_px[1], count=count
+    )
+    states = path_moments(PATHS["courtyard"], count)
+    return [
+        Moment(view, state.pupil_diameter_mm, state.focus_dpt)
+        for view, state in zip(views, states, strict=True)
+    ]
+
+
 def demo_walk(size_px: tuple[int, int], count: int, rate_hz: float) -> Sequence[Moment]:
     """Return the demo's walk through the courtyard, at the pace of a stream."""
-    from tests.benchmarks.live_walk import Walk
-
-    walk = Walk.of(size_px, 96)
-    order = [number * 96 // count for number in range(count)]
-    return [Moment(walk.views[k], **walk.states[k]) for k in order]
+    walk = courtyard_walk(size_px, 96)
+    return [walk[number * 96 // count] for number in range(count)]
