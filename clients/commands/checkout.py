@@ -39,7 +39,7 @@ def run_benchmark(
     Requires a checkout; `ocufilter latency` measures a running service without one.
     Other options are passed to the benchmark:
 
-    ocufilter bench roundtrip --transport shm --stereo
+    ocufilter bench faults --only upgrade
     """
     names = sorted(
         path.stem.removeprefix("bench_") for path in _benchmarks().glob("bench_*.py")

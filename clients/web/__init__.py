@@ -25,7 +25,6 @@ widgets        sliders, with range_slider.js, uploads and choices
 From slider to picture: `page` passes a request to `filter_thread`, which never runs on
 the page's event loop; its thread passes pictures to the `PictureSender`. `EyeFilter`
 runs in this process: a service would add the transfer in both directions (for 1280 x
-720 px, wire and queue: 1.1 ms through shared memory, 4.5 ms over ipc,
-tests/benchmarks/results/roundtrip_*_mono.json) and gain nothing, as PSFs are built in
-a separate process either way.
+720 px, wire and queue: 1.1 ms through shared memory, 4.5 ms over ipc, `ocufilter bench
+latency`) and gain nothing, as PSFs are built in a separate process either way.
 """

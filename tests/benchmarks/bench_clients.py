@@ -1,7 +1,5 @@
 """Memory, frame rate and processor time by the number of clients and eyes.
 
-    python -m tests.benchmarks.bench_clients [--quick] [--json]
-
 1, 2 and 4 clients stream at once through eyes of their own, with one or two eyes each:
 640x360 pixels per eye, as fast as the service answers.  Pupil and focus change in every
 frame, through a cycle whose PSFs exist before the measurement.  Images are in shared
@@ -10,103 +8,67 @@ slow down a run and never speed it up.
 
 Times: processor time of all processes of the service per frame and eye, of the best and
 of the worst run.  Memory: that of `ocufilter status`, at the end.  Error: frames
-without a result.  Writes results/clients.json, with the frame rate, the memory of all
-processes including those that `status` does not count, and the memory without a client.
+without a result.  ``best_runs`` has the frame rate, the memory of all processes
+including those that `status` does not count, and the memory without a client.
 """
 
-import argparse
 import math
 import os
-import threading
 import time
 from collections import Counter
-from dataclasses import dataclass, field
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-from clients.filter_client import FilterClient, FilteredFrame, ViewState
+from clients.filter_client import FilterClient, ViewState
 from clients.latency.stream import EYES, StreamSettings, make_frames
 from clients.service_process import ServiceProcess
-from filter_service.messages import Dropped, ErrorReply
-from tests.benchmarks.harness import Row, publish
+from tests.benchmarks.harness import Row, Run
+from tests.benchmarks.service_stream import Stream, processor_s
 
+MINUTES = 8
 SIZE_PX = (640, 360)
 WARM_UP_S, MEASURED_S = 1.0, 6.0
 N_STATES = 24
 PREPARE_LIMIT_S = 120.0
-TICKS_PER_S = os.sysconf("SC_CLK_TCK")
 
 
-@dataclass
-class Stream:
-    """One client, its number of eyes and what it counts."""
+def prepared_stream(endpoint: str, index: int, n_eyes: int) -> Stream:
+    """Return a client whose eyes and PSFs exist."""
+    profiles = [
+        {
+            "kind": "prescription",
+            "eye_side": side,
+            "sphere_dpt": -1.0 - index - 0.25 * eye,
+        }
+        for eye, side in enumerate(("OS", "OD"))
+    ]
+    settings = StreamSettings(
+        *SIZE_PX,
+        *(n_eyes, 0.0, 1.0, profiles[0], {}, 4.0, 0.0, "srgb8", 2),
+        right_profile=profiles[1] if n_eyes == 2 else None,
+    )
+    frames = make_frames(settings)
 
-    index: int
-    n_eyes: int
-    n_filtered: int = 0
-    failed: Counter[str] = field(default_factory=Counter)
-    failures: list[BaseException] = field(default_factory=list)
+    def state(number: int) -> dict[str, Any]:
+        phase = 2 * math.pi * (number / N_STATES + index / 4)
+        return {
+            "pupil_diameter_mm": 4 + math.sin(phase),
+            "focus_dpt": 1 + math.cos(phase),
+            "states": settings.states if n_eyes == 2 else [ViewState()],
+        }
 
-    def run(self, endpoint: str, barrier: threading.Barrier) -> None:
-        """Prepare the eyes, wait for the others and stream."""
-        try:
-            with FilterClient(endpoint, timeout_s=PREPARE_LIMIT_S) as client:
-                self._stream(client, barrier)
-        except BaseException as error:
-            self.failures.append(error)
-            barrier.abort()
-
-    def _profile(self, eye: int) -> dict:
-        side = ("OS", "OD")[eye]
-        sphere_dpt = -1.0 - self.index - 0.25 * eye
-        return {"kind": "prescription", "eye_side": side, "sphere_dpt": sphere_dpt}
-
-    def _stream(self, client: FilterClient, barrier: threading.Barrier) -> None:
-        right = self._profile(1) if self.n_eyes == 2 else None
-        settings = StreamSettings(
-            *SIZE_PX,
-            *(self.n_eyes, 0.0, 1.0, self._profile(0), {}, 4.0, 0.0, "srgb8", 2),
-            right_profile=right,
-        )
-        frames = make_frames(settings)
-        if right is None:
-            client.set_profile(settings.profile, views=frames[0])
+    def prepare(client: FilterClient) -> None:
+        if n_eyes == 1:
+            client.set_profile(profiles[0], views=frames[0])
         else:
             for eye, name in enumerate(EYES):
-                client.set_profile(self._profile(eye), eye=name, views=[frames[0][eye]])
-        states = settings.states if right else [ViewState()]
+                client.set_profile(profiles[eye], eye=name, views=[frames[0][eye]])
+        for number in range(N_STATES):
+            frame = frames[number % len(frames)]
+            client.filter(frame, timeout_s=PREPARE_LIMIT_S, **state(number))
 
-        def values(n: int) -> dict[str, Any]:
-            phase = 2 * math.pi * (n / N_STATES + self.index / 4)
-            return {
-                "pupil_diameter_mm": 4 + math.sin(phase),
-                "focus_dpt": 1 + math.cos(phase),
-                "states": states,
-            }
-
-        for n in range(N_STATES):
-            client.filter(
-                frames[n % len(frames)], timeout_s=PREPARE_LIMIT_S, **values(n)
-            )
-        barrier.wait()
-        start_s = time.monotonic()
-        begin_s, end_s = start_s + WARM_UP_S, start_s + WARM_UP_S + MEASURED_S
-        n_submitted = 0
-        while time.monotonic() < end_s:
-            if not client.n_unanswered:
-                frame = frames[n_submitted % len(frames)]
-                client.submit(frame, **values(n_submitted % N_STATES))
-                n_submitted += 1
-                continue
-            for event in client.poll(1.0):
-                is_counted = time.monotonic() >= begin_s
-                self.n_filtered += is_counted and isinstance(event, FilteredFrame)
-                if isinstance(event, Dropped):
-                    self.failed[event.reason] += 1
-                elif isinstance(event, ErrorReply):
-                    self.failed[event.code] += 1
-        barrier.wait()  # memory is read while all sessions exist
-        barrier.wait()
+    return Stream(endpoint, frames, state=state, prepare=prepare)
 
 
 def processes_of(pid: int) -> list[int]:
@@ -116,15 +78,6 @@ def processes_of(pid: int) -> list[int]:
         for child in (task / "children").read_text().split():
             found += processes_of(int(child))
     return found
-
-
-def cpu_s_of(pids: list[int]) -> float:
-    """Return the processor time that processes have used, user and system."""
-    ticks = 0
-    for pid in pids:
-        words = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
-        ticks += int(words[11]) + int(words[12])
-    return ticks / TICKS_PER_S
 
 
 def memory_mb_of(pids: list[int]) -> float:
@@ -137,36 +90,38 @@ def memory_mb_of(pids: list[int]) -> float:
     return 1.024e-3 * kilobytes
 
 
-def measure(n_clients: int, n_eyes: int) -> dict:
+def streamed(n_clients: int, n_eyes: int) -> dict:
     """Run the streams once against a new service; return the figures."""
-    streams = [Stream(i, n_eyes) for i in range(n_clients)]
-    barrier = threading.Barrier(n_clients + 1, timeout=300.0)
-    with ServiceProcess({"threads": len(os.sched_getaffinity(0))}) as service:
-        pids = processes_of(service.process.pid)
-        with FilterClient(service.endpoint, timeout_s=30.0) as observer:
-            idle_mb = observer.ping()[1].memory_mb
-            threads = [
-                threading.Thread(target=stream.run, args=(service.endpoint, barrier))
-                for stream in streams
-            ]
-            for thread in threads:
-                thread.start()
-            barrier.wait()
-            time.sleep(WARM_UP_S)
-            pids = processes_of(service.process.pid)
-            cpu_s, start_s = cpu_s_of(pids), time.monotonic()
-            barrier.wait()
-            cpu_s, duration_s = cpu_s_of(pids) - cpu_s, time.monotonic() - start_s
-            memory_mb = observer.ping()[1].memory_mb
-            all_mb = memory_mb_of(processes_of(service.process.pid))
-            barrier.wait()
-            for thread in threads:
-                thread.join()
+    with ExitStack() as closing:
+        service = closing.enter_context(
+            ServiceProcess({"threads": len(os.sched_getaffinity(0))})
+        )
+        observer = closing.enter_context(FilterClient(service.endpoint, timeout_s=30.0))
+        idle_mb = observer.ping()[1].memory_mb
+        streams = [
+            prepared_stream(service.endpoint, index, n_eyes)
+            for index in range(n_clients)
+        ]
         for stream in streams:
-            if stream.failures:
-                raise stream.failures[0]
-    n_images = n_eyes * sum(stream.n_filtered for stream in streams)
-    rates_hz = [stream.n_filtered / MEASURED_S for stream in streams]
+            closing.enter_context(stream)
+        time.sleep(WARM_UP_S)
+        pids = processes_of(service.process.pid)
+        cpu_s, start_s = processor_s(pids), time.monotonic()
+        time.sleep(MEASURED_S)
+        cpu_s, end_s = processor_s(pids) - cpu_s, time.monotonic()
+        for stream in streams:
+            stream.stop()
+        memory_mb = observer.ping()[1].memory_mb
+        all_mb = memory_mb_of(processes_of(service.process.pid))
+    duration_s = end_s - start_s
+    counts = [
+        sum(start_s <= one.at_s <= end_s for one in stream.filtered())
+        for stream in streams
+    ]
+    failed: Counter[str] = Counter()
+    for stream in streams:
+        failed += Counter(o.kind for o in stream.seen if o.kind != "filtered")
+    n_images, rates_hz = n_eyes * sum(counts), [n / duration_s for n in counts]
     return {
         "clients": n_clients,
         "eyes_per_client": n_eyes,
@@ -179,43 +134,31 @@ def measure(n_clients: int, n_eyes: int) -> dict:
         "memory_idle_mb": round(idle_mb),
         "memory_mb": round(memory_mb),
         "memory_all_processes_mb": round(all_mb),
-        "failed_frames": dict(sum((s.failed for s in streams), Counter())),
+        "failed_frames": dict(failed),
     }
 
 
-def main(argv=None) -> None:
-    """Run all cases, print and publish them."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--quick", action="store_true", help="one run of each case")
-    parser.add_argument("--json", action="store_true", help="print JSON")
-    options = parser.parse_args(argv)
+def measure(run: Run) -> tuple[list[Row], dict[str, list[dict]]]:
+    """Return a row and the best run of each case."""
     rows, bests = [], []
-    for n_eyes in (1, 2):
-        for n_clients in (1, 2, 4):
-            runs = [
-                measure(n_clients, n_eyes) for _ in range(1 if options.quick else 3)
-            ]
-            best = min(runs, key=lambda run: run["cpu_ms_per_image"])
-            n_failed = sum(sum(run["failed_frames"].values()) for run in runs)
-            bests.append(best)
-            rows.append(
-                Row(
-                    bench="clients",
-                    method=f"{n_clients} clients",
-                    case=f"{n_eyes} eyes each",
-                    setting=f"{SIZE_PX[0]}x{SIZE_PX[1]} per eye",
-                    n=len(runs),
-                    median_ms=best["cpu_ms_per_image"],
-                    p95_ms=max(run["cpu_ms_per_image"] for run in runs),
-                    memory_mb=max(run["memory_mb"] for run in runs),
-                    error_name="failed frames",
-                    error=float(n_failed),
-                    reference="a result for every frame",
-                )
+    cases = [(eyes, clients) for eyes in (1, 2) for clients in (1, 2, 4)]
+    for n_eyes, n_clients in cases[3:4] if run.is_quick else cases:
+        runs = [streamed(n_clients, n_eyes) for _ in range(1 if run.is_quick else 3)]
+        best = min(runs, key=lambda one: one["cpu_ms_per_image"])
+        bests.append(best)
+        rows.append(
+            Row(
+                bench="clients",
+                method=f"{n_clients} clients",
+                case=f"{n_eyes} eyes each",
+                setting=f"{SIZE_PX[0]}x{SIZE_PX[1]} per eye",
+                n=len(runs),
+                median_ms=best["cpu_ms_per_image"],
+                p95_ms=max(one["cpu_ms_per_image"] for one in runs),
+                memory_mb=max(one["memory_mb"] for one in runs),
+                error_name="failed frames",
+                error=float(sum(sum(one["failed_frames"].values()) for one in runs)),
+                reference="a result for every frame",
             )
-    is_whole, details = not options.quick, {"best_runs": bests}
-    publish("clients", rows, as_json=options.json, is_whole=is_whole, details=details)
-
-
-if __name__ == "__main__":
-    main()
+        )
+    return rows, {"best_runs": bests}

@@ -29,8 +29,8 @@ from pathlib import Path
 
 import numpy as np
 
-from tests.benchmarks.file_mutants import Kind, kinds, mutant
 from tests.benchmarks.harness import ROOT, Row, publish
+from tests.file_mutants import Kind, kinds, mutant
 
 N_READS, N_COMMANDS = 100_000, 500
 QUICK_READS, QUICK_COMMANDS = 1_500, 6

@@ -1,163 +1,165 @@
-"""Round trips by `ocufilter latency`, by `bench roundtrip` and by a client of its own.
+"""Latency of frames through a service, by transport, mono and stereo.
 
-    ocufilter bench latency --program /opt/ocufilter/bin/ocufilter
+What `ocufilter latency` measures, of services that this benchmark starts: pre-rendered
+frames on a fixed schedule (a frame's due time does not depend on earlier replies) by
+tcp, ipc, shared memory beside ipc, and tcp with encryption (``curve``).  Mono is
+1280x720 at 10 Hz; stereo is a headset's 2 x 1832x1920 at 3 Hz.
 
-Each measures the same stream through one service in another process, in turn.  The
-third client (`latency_protocol_client.py`) is written from PROTOCOL.md alone.
+A row is a stage of a frame, or a sum: ``added_ms`` is the round trip less the
+renderer's stages, ``service_total_ms`` the time in the service, ``age_ms`` counts from
+the schedule.  ``bare_socket`` is the round trip of as many bytes over a bare socket
+between two processes: a lower bound for any protocol.  The error is the PSNR of 8-bit
+images less the same frames in this process, with no tolerance for errors of rendering.
+``frames`` has what became of the frames, and their bytes.
 """
 
-import argparse
-import json
+import socket
 import subprocess
 import sys
 import tempfile
+import time
+from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
 
-from clients.latency.stream import StreamSettings, make_frames
+from clients.latency.measure import (
+    REFERENCE,
+    Case,
+    Measured,
+    Target,
+    compare,
+)
+from clients.latency.measure import measure as measure_case
 from clients.service_process import ServiceProcess
 from filter_service.keys import KeyRing
-from tests.benchmarks.bench_roundtrip import DEFAULT_PROFILE
-from tests.benchmarks.harness import ROOT, report, write_report
+from tests.benchmarks.harness import Row, Run
+from tests.benchmarks.rows import timed_row
 
-SIZE_PX, RATE_HZ = (640, 360), 10.0
-SIZE = "{}x{}".format(*SIZE_PX)
-METHODS = ("ocufilter latency", "bench roundtrip", "client of PROTOCOL.md")
-LIMIT_S = 300.0
+MINUTES = 8
+TRANSPORTS = ("tcp", "ipc", "shm", "curve")
+PROFILE = {"kind": "prescription", "eye_side": "OS", "sphere_dpt": -2}
+KINDS = {
+    # size of a view in px, views, rate in Hz, frames
+    "mono": ((1280, 720), 1, 10.0, 100),
+    "stereo": ((1832, 1920), 2, 3.0, 36),
+}
+QUICK = {"mono": ((320, 180), 1, 20.0, 10)}
+N_EXCHANGES, PAUSE_S = 40, 0.03
+"""Pause between exchanges, about that of a stream, during which processes sleep."""
 
-
-def output_of(*words, cwd) -> str:
-    finished = subprocess.run(
-        [str(word) for word in words],
-        cwd=cwd,
-        capture_output=True,
-        text=True,
-        timeout=LIMIT_S,
-    )
-    if finished.returncode:
-        sys.exit(finished.stderr.strip())
-    return finished.stdout
-
-
-def write_frames(path: Path) -> None:
-    """Write the images of the stream for a client without our code."""
-    profile = json.loads(DEFAULT_PROFILE)
-    settings = StreamSettings(
-        *SIZE_PX, 1, RATE_HZ, 1.0, profile, {}, 4.0, 0.0, "srgb8", 1
-    )
-    views = [frame[0] for frame in make_frames(settings)]
-    np.savez(
-        path,
-        color=np.stack([view.color for view in views]),
-        depth_m=np.stack([view.depth_m for view in views]),
-        tangents=views[0].camera.tangents,
-    )
+ANSWER_WITH = """
+import socket, sys
+family, address, n_up, n_down = sys.argv[1:]
+end = socket.socket(getattr(socket, family))
+end.connect(("127.0.0.1", int(address)) if family == "AF_INET" else address)
+room, answer = memoryview(bytearray(int(n_up))), bytes(int(n_down))
+while True:
+    count = 0
+    while count < len(room):
+        read = end.recv_into(room[count:])
+        if not read:
+            raise SystemExit
+        count += read
+    end.sendall(answer)
+"""
 
 
-class Clients:
-    """The three ways of timing a stream, each as a process."""
-
-    def __init__(self, options: argparse.Namespace, folder: Path) -> None:
-        self.options, self.folder = options, folder
-        self.frames_file = folder / "frames.npz"
-        write_frames(self.frames_file)
-
-    def round_trip_ms(self, method: str, endpoint: str, key: Path | None) -> float:
-        """Return the median of one stream."""
-        n_frames = self.options.frames
-        key_option = [] if key is None else ["--key", key]
-        if method == "ocufilter latency":
-            told = output_of(
-                *(self.options.program or (sys.executable, "-m", "ocufilter")),
-                *("latency", endpoint, "--still", "--transport", "tcp", "--json"),
-                *("--size", SIZE, "--rate-hz", RATE_HZ, "--frames", n_frames),
-                *key_option,
-                cwd=self.folder if self.options.program else ROOT,
-            )
-            return json.loads(told)["rows"][0]["round_trip_ms"]["p50"]
-        if method == "bench roundtrip":
-            told = output_of(
-                *(sys.executable, "-m", "tests.benchmarks.bench_roundtrip"),
-                *("--endpoint", endpoint, "--size", SIZE, "--rate-hz", RATE_HZ),
-                *("--seconds", n_frames / RATE_HZ, "--json", *key_option),
-                cwd=self.options.checkout,
-            )
-            rows = {row["method"]: row for row in json.loads(told)["rows"]}
-            return rows["round_trip_ms"]["median_ms"]
-        script = Path(__file__).with_name("latency_protocol_client.py")
-        words = (endpoint, self.frames_file, RATE_HZ, n_frames, DEFAULT_PROFILE)
-        keys = [] if key is None else [key]
-        times = output_of(sys.executable, script, *words, *keys, cwd=self.folder)
-        return float(np.median(json.loads(times)))
+def bare_socket_ms(transport: str, n_up: int, n_down: int) -> list[float]:
+    """Return round trips of a request and a reply of so many bytes."""
+    family = "AF_INET" if transport in ("tcp", "curve") else "AF_UNIX"
+    times_ms, request, room = [], bytes(n_up), memoryview(bytearray(n_down))
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        socket.socket(getattr(socket, family)) as listener,
+    ):
+        is_tcp = family == "AF_INET"
+        listener.bind(("127.0.0.1", 0) if is_tcp else f"{folder}/floor")
+        listener.listen(1)
+        listener.settimeout(10.0)
+        name = listener.getsockname()
+        where = [family, str(name[1] if is_tcp else name), str(n_up), str(n_down)]
+        peer = subprocess.Popen([sys.executable, "-c", ANSWER_WITH, *where])
+        try:
+            with listener.accept()[0] as end:
+                for _ in range(N_EXCHANGES):
+                    start_s = time.perf_counter()
+                    end.sendall(request)
+                    count = 0
+                    while count < n_down:
+                        count += end.recv_into(room[count:])
+                    times_ms.append(1e3 * (time.perf_counter() - start_s))
+                    time.sleep(PAUSE_S)
+        finally:
+            peer.wait(10.0)
+    return times_ms
 
 
-def compare(clients: Clients, *, transport: str, rounds: int) -> list[dict]:
-    """Return a row for each client."""
-    settings, key = {}, None
-    if transport == "CURVE":
-        ring, key = KeyRing(clients.folder / "keys"), clients.folder / "key.toml"
-        ring.add("benchmark", key)
-        settings = {"keys_dir": str(ring.folder)}
-    found: dict[str, list[float]] = {method: [] for method in METHODS}
-    with ServiceProcess(settings) as service:
-        for number in range(rounds):
-            turn = number % len(METHODS)
-            for method in METHODS[turn:] + METHODS[:turn]:
-                ms = clients.round_trip_ms(method, service.endpoint, key)
-                found[method].append(round(ms, 3))
-                sys.stderr.write(f"{transport}, {method}: {ms:.2f} ms\n")
-    base_ms = np.median(found["bench roundtrip"])
-    return [
-        {
-            "bench": "latency",
-            "method": method,
-            "case": f"{SIZE}, {RATE_HZ:g} Hz",
-            "setting": transport,
-            "n": rounds * clients.options.frames,
-            "median_ms": float(np.median(medians_ms)),
-            "round_medians_ms": medians_ms,
-            "error_name": "relative_difference_to_bench_roundtrip",
-            "error": float(np.median(medians_ms) / base_ms - 1),
-            "reference": "bench roundtrip, in turn",
-        }
-        for method, medians_ms in found.items()
-    ]
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(
-        prog="ocufilter bench latency", description=__doc__.splitlines()[0]
-    )
-    parser.add_argument("--program", nargs=1, help="another `ocufilter`, of a wheel")
-    parser.add_argument(
-        "--checkout", type=Path, default=ROOT, help="of `bench roundtrip`"
-    )
-    parser.add_argument("--frames", type=int, default=100, help="of each stream")
-    parser.add_argument("--rounds", type=int, default=5)
-    parser.add_argument("--quick", action="store_true", help="20 frames, one round")
-    parser.add_argument("--json", action="store_true")
-    options = parser.parse_args()
-    is_whole = not options.quick
-    if options.quick:
-        options.frames, options.rounds = 20, 1
-    rows = []
-    with tempfile.TemporaryDirectory() as folder:
-        clients = Clients(options, Path(folder))
-        for transport in ("tcp", "CURVE"):
-            rows += compare(clients, transport=transport, rounds=options.rounds)
-    content = report(rows=[]) | {"rows": rows}
-    if is_whole:
-        write_report("latency", content)
-    if options.json:
-        print(json.dumps(content))
-        return
-    for row in rows:
-        print(
-            f"{row['setting']:<6} {row['method']:<22} {row['median_ms']:8.2f} ms "
-            f"{100 * row['error']:+6.1f} %  of {row['round_medians_ms']}"
+def measured(transport: str, kind: str, cases: dict) -> tuple[Target, Measured]:
+    """Start a service and measure one case."""
+    size_px, n_views, rate_hz, n_frames = cases[kind]
+    with ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        settings, key_file = {}, None
+        if transport in ("ipc", "shm"):
+            settings = {"bind": f"ipc://{folder}/service"}
+        elif transport == "curve":
+            key_file, keys = folder / "key.toml", KeyRing(folder / "keys")
+            keys.add("benchmark", key_file)
+            settings = {"keys_dir": str(keys.folder)}
+        service = stack.enter_context(ServiceProcess(settings))
+        target = Target(
+            *(service.endpoint, key_file, 30.0, PROFILE, {}, n_frames),
+            is_moving=False,
         )
+        how = "shared-memory" if transport == "shm" else "tcp"
+        return target, measure_case(target, Case(how, size_px, n_views, rate_hz))
 
 
-if __name__ == "__main__":
-    main()
+def rows_of(transport: str, kind: str, found: Measured) -> tuple[list[Row], dict]:
+    """Return a row for each stage, for the sums and the bare socket, and the counts."""
+    run, settings = found.run, found.run.settings
+    sent, received = run.n_bytes_per_frame
+    stages = {name: run.stages_ms[name] for name in run.stage_names()}
+    stages["bare_socket"] = bare_socket_ms(transport, sent, received)
+    views = f"{settings.n_views} x " * (settings.n_views > 1)
+    setting = (
+        f"{views}{settings.width_px}x{settings.height_px}, {settings.rate_hz:g} Hz "
+        f"for {settings.duration_s:g} s, {run.renderer}"
+    )
+    case = f"{transport}, {kind}"
+    error_db = (found.error or {}).get("psnr_db", float("nan"))
+    rows = [
+        timed_row(
+            *("latency", name, case, setting, times_ms),
+            *("psnr_db", error_db, REFERENCE),
+            mb=run.memory_end_mb,
+        )
+        for name, times_ms in stages.items()
+    ]
+    return rows, {
+        "case": case,
+        "scheduled": settings.n_scheduled,
+        "filtered": run.n_filtered,
+        "dropped": dict(run.drops),
+        "filtered_hz": round(run.n_filtered / run.duration_s, 3),
+        "bytes_sent_per_frame": sent,
+        "bytes_received_per_frame": received,
+        "profile_change_ms": round(float(np.median(found.change_ms)), 1),
+    }
+
+
+def measure(run: Run) -> tuple[list[Row], dict[str, list[dict]]]:
+    """Return the rows of all cases, and the counts of their frames."""
+    cases = QUICK if run.is_quick else KINDS
+    rows: list[Row] = []
+    frames: list[dict] = []
+    for kind in cases:
+        for transport in TRANSPORTS:
+            target, found = measured(transport, kind, cases)
+            compare(target, [found])  # after the stream: it takes all cores
+            of_case, counts = rows_of(transport, kind, found)
+            rows += of_case
+            frames.append(counts)
+            print(f"latency: {counts['case']}", file=sys.stderr, flush=True)
+    return rows, {"frames": frames}

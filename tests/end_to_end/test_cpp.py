@@ -22,9 +22,9 @@ from filter_service import messages
 from filter_service.keys import KeyRing
 from filter_service.messages import encode, tangents_from_fov
 from filter_service.wire.replies import Result, ResultView
-from tests.benchmarks.mutated_messages import mutated
 from tests.end_to_end.conftest import QUICK_DOUBLE, TIMEOUT_S
 from tests.end_to_end.test_lifecycle import wait_until
+from tests.mutated_messages import mutated
 from tests.page_commands import WAYS_PAGE
 from tests.unit.message_parts import REPLIES, as_bytes
 

@@ -16,7 +16,7 @@ from clients.filter_client import FilterClient, FilteredFrame
 from filter_service.errors import FilterError
 from filter_service.messages import Hello, Ping, ProfileRequest, encode
 from filter_service.wire.replies import Dropped
-from tests.benchmarks.attacks import spoken_to
+from tests.attacks import spoken_to
 from tests.end_to_end.conftest import TIMEOUT_S, RawClient, make_view, small_frame
 from tests.end_to_end.test_lifecycle import children_of, wait_until
 

@@ -17,7 +17,7 @@ from filter_service.errors import FilterError
 from filter_service.keys import KeyRing, load_client_key
 from filter_service.messages import Hello, Ping, encode
 from filter_service.service.router import SEED_VARIABLE
-from tests.benchmarks.attacks import spoken_to
+from tests.attacks import spoken_to
 from tests.end_to_end.conftest import (
     DOUBLE,
     TIMEOUT_S,
@@ -30,7 +30,7 @@ pytestmark = pytest.mark.clock
 
 SEE = {"pupil_diameter_mm": 4.0, "focus_dpt": 0.5}
 EYE = {"kind": "double", "mark": 5}
-ATTACK = (sys.executable, "-m", "tests.benchmarks.attacks")
+ATTACK = (sys.executable, "-m", "tests.attacks")
 
 
 def limited(n_files):

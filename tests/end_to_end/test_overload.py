@@ -1,17 +1,15 @@
 """More frames than can be filtered, and clients that do not read: age and memory."""
 
 import json
-import subprocess
 import time
 
 import numpy as np
 import pytest
 
 from clients.filter_client import FilterClient, FilteredFrame
-from clients.service_process import CHECKOUT
 from filter_service.messages import Ping, encode
 from filter_service.wire.replies import Dropped
-from tests.benchmarks.bench_abuse import ATTACK, Guest
+from tests.benchmarks.bench_abuse import guest, started
 from tests.end_to_end.conftest import make_view, small_frame
 from tests.end_to_end.test_lifecycle import wait_until
 
@@ -138,18 +136,13 @@ def test_a_flood_of_profiles_takes_no_more_than_a_second_stream(real_service, ki
     rates_hz = {"stream": [], f"flood_{kind}": []}
     silences_s = []
     before = real_service.pids()
-    with Guest(real_service.endpoint, body=body) as guest:
-        wait_until(lambda: guest.n_filtered, limit_s=60.0)
+    with guest(real_service.endpoint, body=body) as stream:
+        wait_until(stream.filtered, limit_s=60.0)
         for name in [*rates_hz] * 2:
-            attack = subprocess.Popen(
-                [*ATTACK, name, real_service.endpoint, "3"],
-                cwd=CHECKOUT,
-                stdout=subprocess.PIPE,
-                text=True,
-            )
+            attack = started(name, real_service.endpoint, 3.0)
             assert attack.stdout.readline() == "begun\n"
             time.sleep(0.5)
-            hz, silence_s = guest.watch(2.0)
+            hz, silence_s = stream.watch(2.0)
             rates_hz[name].append(hz)
             counts = json.loads(attack.communicate()[0])
             if name == "stream":
@@ -157,7 +150,7 @@ def test_a_flood_of_profiles_takes_no_more_than_a_second_stream(real_service, ki
             else:
                 silences_s.append(silence_s)
                 assert counts["sent"] > 100
-        assert not guest.errors
+        assert not stream.errors
     beside_stream_hz, beside_flood_hz = map(max, rates_hz.values())
     assert beside_flood_hz > 0.8 * beside_stream_hz
     assert min(silences_s) < 1.0

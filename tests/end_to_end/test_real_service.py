@@ -17,8 +17,7 @@ from clients.service_process import CHECKOUT
 from filter_service import EyeFilter, FilterSettings, ViewState, errors
 from filter_service.camera import tangents_from_fov
 from filter_service.messages import Camera, Dropped, body_of_eye
-from tests.benchmarks import bench_roundtrip
-from tests.commands import run_command, run_main
+from tests.commands import run_command
 from tests.numerical.surface_bodies import RELAXED
 
 SEE = {"pupil_diameter_mm": 4.0, "focus_dpt": 0.0, "output": "linear"}
@@ -365,42 +364,6 @@ def test_a_killed_worker_is_told_and_the_next_build_works(real_service, real_cli
     assert edge_width_px(real_client.filter(view, **SEE).color) <= 1
     real_client.set_profile(MYOPIA, settings=ON_AXIS, views=[view])
     assert edge_width_px(real_client.filter(view, **SEE).color) >= 4
-
-
-@pytest.mark.tools
-def test_the_latency_benchmark_reports_stages_that_explain_the_age(
-    real_service, tmp_path
-):
-    plot = tmp_path / "latency.png"
-    finished = subprocess.run(
-        [
-            *(sys.executable, "-m", "tests.benchmarks.bench_roundtrip"),
-            *("--endpoint", real_service.endpoint, "--size", "96x54"),
-            *("--rate-hz", "20", "--seconds", "1", "--plot", str(plot), "--json"),
-            *("--settings", json.dumps(NARROW)),
-        ],
-        cwd=CHECKOUT,
-        capture_output=True,
-        text=True,
-        timeout=60,
-    )
-    assert finished.returncode == 0, finished.stderr
-    report = json.loads(finished.stdout)
-    assert report["frames"]["scheduled"] == 20
-    n_dropped = sum(report["frames"]["dropped"].values())
-    assert report["frames"]["filtered"] + n_dropped == 20
-    median_ms = {row["method"]: row["median_ms"] for row in report["rows"]}
-    assert median_ms["age_ms"] >= median_ms["service_total_ms"]
-    assert median_ms["splat_ms"] > 0
-    assert all(row["error"] == 0 for row in report["rows"])
-    assert plot.read_bytes().startswith(b"\x89PNG")
-    assert "frames filtered" in " ".join(finished.stderr.split())  # it is wrapped
-
-
-def test_the_benchmark_refuses_nonsense_by_option():
-    finished = run_main(bench_roundtrip.main, "--size", "12")
-    assert finished.returncode == 2
-    assert "--size is '12'" in finished.stderr
 
 
 def test_a_remote_interface_is_refused_by_the_program():

@@ -1,6 +1,6 @@
 """Changed files and random profiles: one error type, bounded work and memory.
 
-`tests/benchmarks/file_mutants.py` lists the readers of files from outside.  Every
+`tests/file_mutants.py` lists the readers of files from outside.  Every
 changed file has a number, which repeats it: `mutant(kind, number)`.
 """
 
@@ -25,7 +25,7 @@ from tests.benchmarks.bench_files import (
     Reads,
     outcome_of,
 )
-from tests.benchmarks.file_mutants import kinds, mutant
+from tests.file_mutants import kinds, mutant
 from tests.schema_profiles import EXTREMES, disturbed, drawn_profile
 
 N_FILES, N_PROFILES = 2_000, 20_000

@@ -11,7 +11,7 @@ from filter_service.messages import (
     decode_request,
     encode,
 )
-from tests.benchmarks.mutated_messages import examples, mutated
+from tests.mutated_messages import examples, mutated
 from tests.unit.message_parts import (
     REQUESTS,
     as_bytes,

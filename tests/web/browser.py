@@ -2,6 +2,7 @@
 
 import io
 import shutil
+import time
 
 import numpy as np
 from PIL import Image
@@ -23,10 +24,11 @@ def open_browser(playwright):
 class PageUnderTest:
     """The page, as a person sees it."""
 
-    def __init__(self, page) -> None:
+    def __init__(self, page, wait_ms: int = WAIT_MS) -> None:
         self.page = page
+        self.wait_ms = wait_ms
         self.errors = []
-        page.set_default_timeout(WAIT_MS)
+        page.set_default_timeout(wait_ms)
         page.on("pageerror", lambda error: self.errors.append(str(error)))
 
     def open(self, address) -> None:
@@ -69,19 +71,28 @@ class PageUnderTest:
         """Wait for a full picture of a newer wish; return what was told of it.
 
         Newest: no preview of a later wish came before it.
+
+        Raises
+        ------
+        TimeoutError
+            If pictures keep changing for `wait_ms`.
         """
+        end_s = time.monotonic() + 1e-3 * self.wait_ms
         wanted = f"""({DRAWN}).filter(d => d.eye === '{eye}').at(-1)"""
-        while True:
+        while time.monotonic() < end_s:
             self.page.wait_for_function(
                 f"(() => {{ const last = {wanted}; return last && last.kind === 'full' "
                 f"&& last.number > {after}; }})()",
-                timeout=WAIT_MS,
+                timeout=self.wait_ms,
             )
             found = self.page.evaluate(wanted)
             # an entry may send two requests: a preview of the second follows at once
             self.page.wait_for_timeout(REST_MS)
             if self.page.evaluate(wanted) == found:
                 return found
+        raise TimeoutError(
+            f"the pictures of {eye} still change after {self.wait_ms} ms"
+        )
 
     def seen(self, eye: str = "OD", layer: str = "after"):
         """Return the pixels that are drawn for an eye, (h, w, 3)."""

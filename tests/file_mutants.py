@@ -30,7 +30,7 @@ from tests.unit.image_bytes import (
     table_profile,
 )
 
-DATA = Path(__file__).parents[1] / "data"
+DATA = Path(__file__).parent / "data"
 CORPUS = DATA.with_name("corpus")
 PEOPLE = DATA / "peripheral_wavefronts.npz"
 PUBLISHED = DATA.parents[1] / "estimator" / "profiles" / "published"

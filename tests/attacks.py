@@ -28,7 +28,7 @@ from filter_service.messages import (
     decode_reply,
     encode,
 )
-from tests.benchmarks.mutated_messages import examples, mutated, view_of
+from tests.mutated_messages import examples, mutated, view_of
 
 N_BARE = 1500
 N_PARTS = 6_000_000
