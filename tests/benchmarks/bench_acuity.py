@@ -16,6 +16,7 @@
 """
 
 import time
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -36,7 +37,8 @@ from estimator.profiles.typical_aberrations import (
     typical_zernike_um,
 )
 from tests import human_data
-from tests.benchmarks.harness import Row, Run, memory_mb
+from tests.benchmarks.harness import Row, Run
+from tests.benchmarks.rows import timed_row
 
 MINUTES = 1
 PEOPLE = Path(__file__).parents[1] / "data" / "peripheral_wavefronts.npz"
@@ -52,12 +54,7 @@ DEFOCUS_DPT = (0.5, 1.0, 2.0, 3.0, 4.0)
 FOVEAL_CPD = 65.37
 
 
-def _row(method, case, setting, n, times_ms, name, error, reference) -> Row:
-    median_ms, p95_ms = np.percentile(times_ms, (50, 95)).tolist()
-    return Row(
-        *("acuity", method, case, setting, n, median_ms, p95_ms, memory_mb()),
-        *(name, float(error), reference),
-    )
+row = partial(timed_row, "acuity")
 
 
 def measured_eyes(residual_dpt: float) -> list[NDArray[np.float64]]:
@@ -95,10 +92,10 @@ def transfer_rows(step: int) -> list[Row]:
             AT_CPD, np.mean(passed, axis=0), expected, strict=True
         ):
             rows.append(
-                _row(
+                row(
                     *("transfer", f"residue {residual_dpt:g} dpt"),
                     f"{cpd:g} cpd, {PEOPLE_PUPIL_MM:g} mm: {found:.3f}",
-                    *(len(passed), times_ms, "modulation", found - wanted),
+                    *(times_ms, "modulation", found - wanted),
                     "Watson 2013",
                 )
             )
@@ -141,14 +138,14 @@ def acuity_rows(pupils_mm, defocus_dpt) -> list[Row]:
             if np.ptp(theirs) <= 0.1:
                 beyond = abs(found.log_mar - theirs.mean())
             rows.append(
-                _row(
+                row(
                     "in focus" if error_dpt == 0.0 else "out of focus",
                     f"{pupil_mm:g} mm",
                     f"{error_dpt:g} dpt: {found.log_mar:.2f}, published "
                     f"{theirs.min():.2f} to {theirs.max():.2f} "
                     f"(beyond the range by {beyond:.2f}), "
                     f"VSOTF {found.visual_strehl_ratio:.3f}",
-                    *(1, times_ms, "logMAR", found.log_mar - theirs.mean()),
+                    *(times_ms, "logMAR", found.log_mar - theirs.mean()),
                     ", ".join(published),
                 )
             )
@@ -161,8 +158,8 @@ def retina_rows() -> list[Row]:
     found = float(retina_nyquist_cpd(0.0, 0.0, eye_side="OD"))
     times_ms = [1e3 * (time.perf_counter() - start_s)]
     return [
-        _row(
-            *("retina", "fovea", f"{found:.2f} cpd", 1, times_ms),
+        row(
+            *("retina", "fovea", f"{found:.2f} cpd", times_ms),
             *("cpd", found - FOVEAL_CPD, "Watson 2014"),
         )
     ]
@@ -183,9 +180,8 @@ def summary_rows(rows: list[Row]) -> list[Row]:
                 ("largest |error|", np.abs(errors).max()),
             ):
                 found.append(
-                    _row(
-                        *(method, case, name, len(of_case)),
-                        [r.median_ms for r in of_case],
+                    row(
+                        *(method, case, name, [r.median_ms for r in of_case]),
                         *(of_case[0].error_name, value, of_case[0].reference),
                     )
                 )

@@ -1,7 +1,5 @@
 """Lenses compared with closed forms, diffraction theory and published designs.
 
-    python -m tests.benchmarks.bench_corrections [--quick] [--json]
-
 - ``closed form``: what spectacles, turned and decentred lenses, diffractive orders and
   progressive lenses must do, less what they do here.
 - ``diffraction``: largest difference of the modulation through focus, 2 to 38 cpd,
@@ -14,11 +12,8 @@
   lenses could be read.  And how wide a progressive lens's corridor is said to be.
 - ``plan``: PSNR that blended PSFs have, less what their plan predicts.
 - ``kernels``: time of a PSF with and without rings in the pupil.
-
-Writes results/corrections.json and corrections.png.
 """
 
-import argparse
 import time
 from functools import partial
 
@@ -31,10 +26,10 @@ from estimator.optics.zernike import index_from_nm
 from estimator.profiles.parse import parse_profile
 from estimator.psf.compute import compute_psf_batch
 from estimator.wavefront.field_wavefronts import zernike_from_polynomial
-from tests.benchmarks.harness import RESULTS, Row, memory_mb, publish, time_calls
-from tests.benchmarks.lens_picture import draw_lenses
-from tests.benchmarks.lens_plans import STATES, planned_and_measured
-from tests.benchmarks.people_rows import found_in_people
+from filter_service.planning.plan import unchecked_plan
+from filter_service.psfs.eye_for_spec import eye_for_spec
+from tests.benchmarks.harness import Row, Run, time_calls
+from tests.benchmarks.rows import timed_row
 from tests.lens_truth import (
     MM_PER_DEG,
     PUBLISHED,
@@ -43,6 +38,13 @@ from tests.lens_truth import (
     lenslets_truth,
     modulation,
     worn_eye,
+)
+from tests.numerical.plan_cases import mean_db, sampled_errors, spec_for
+from tests.worn_by_people import (
+    TABLES,
+    corridor_width_mm,
+    lost_by_lenslets,
+    read_through_focus,
 )
 
 THROUGH_FOCUS_DPT = np.arange(0.0, 3.61, 0.05)
@@ -68,14 +70,11 @@ LINES = {
 PEAK_LEAST = 0.08
 BEFORE_PUPIL_MM = 15.05
 KERNELS = 96
+STATES, IMAGES_PX = 100, ((480, 270), (1280, 720))
+MINUTES = 0
 
 
-def _row(method, case, setting, times_ms, name, error, reference, n=1) -> Row:
-    median_ms, p95_ms = np.percentile(times_ms, (50, 95)).tolist()
-    return Row(
-        *("corrections", method, case, setting, n, median_ms, p95_ms, memory_mb()),
-        *(name, float(error), reference),
-    )
+row = partial(timed_row, "corrections")
 
 
 def _timed(function):
@@ -98,7 +97,7 @@ def closed_form_rows() -> list[Row]:
         value, times_ms = _timed(found)
         text = f"{setting}: {value:.4g}"
         error = value - expected
-        rows.append(_row("closed form", case, text, times_ms, name, error, reference))
+        rows.append(row("closed form", case, text, times_ms, name, error, reference))
 
     add(
         *("spectacles", "-10 dpt at 12 mm"),
@@ -217,9 +216,10 @@ def diffraction_rows(pupils_mm) -> list[Row]:
                         continue
                     error = np.abs(other - true).max()
                     rows.append(
-                        _row(
+                        row(
                             *(method, name, setting, times_ms, "modulation", error),
-                            *("true profile, FFT", OBJECTS_DPT.size),
+                            "true profile, FFT",
+                            n=OBJECTS_DPT.size,
                         )
                     )
     return rows
@@ -237,7 +237,7 @@ def lenslet_rows(pupils_mm) -> list[Row]:
                 eye.rings.seen_from(0.0, 0.0), **seen, depth_mm=BEFORE_PUPIL_MM
             )
             rows.append(
-                _row(
+                row(
                     *(
                         "diffraction",
                         "lenslets",
@@ -273,11 +273,11 @@ def peaks(values) -> list[int]:
     return (1 + np.flatnonzero(inside)).tolist()
 
 
-def transfer_rows() -> tuple[list[Row], dict]:
-    """Return rows of published modulations, and the curves through focus."""
+def transfer_rows() -> list[Row]:
+    """Return rows of published modulations."""
     table = PUBLISHED["transfer"]
     at_cpd = [table["line_pairs_per_mm"] * MM_PER_DEG]
-    rows, curves = [], {}
+    rows = []
     for name, lens in table["lenses"].items():
         found, times_ms = _timed(
             partial(
@@ -290,15 +290,14 @@ def transfer_rows() -> tuple[list[Row], dict]:
             )
         )
         curve = np.abs(found[:, 0])
-        curves[name] = curve
         for focus, at in foci_of(curve, lens).items():
             rows.append(
-                _row(
+                row(
                     *("published", name, f"{focus}: {curve[at]:.3f}", times_ms),
                     *("modulation", curve[at] - lens[focus], table["source"]),
                 )
             )
-    return rows, curves
+    return rows
 
 
 def foci_of(curve, lens: dict) -> dict[str, int]:
@@ -341,7 +340,7 @@ def distance_rows() -> list[Row]:
                 cm = 100.0 / THROUGH_FOCUS_DPT[at]
                 error = cm - lens[f"{focus}_cm"]
                 rows.append(
-                    _row(
+                    row(
                         *("published", name, f"{focus}: {cm:.1f} cm", times_ms),
                         *("cm", error, lens["source"]),
                     )
@@ -356,7 +355,7 @@ def toric_rows() -> list[Row]:
     for degrees, expected in rotation["left_ratio_by_deg"].items():
         left, times_ms = _timed(partial(left_cylinder_dpt, float(degrees)))
         rows.append(
-            _row(
+            row(
                 *("published", "toric, turned", f"{degrees} deg: {left / 2.0:.3f}"),
                 *(times_ms, "ratio", left / 2.0 - expected, rotation["source"]),
             )
@@ -368,7 +367,7 @@ def toric_rows() -> list[Row]:
     _, j0, j45 = rx.power_vector(lens)
     found = 2.0 * float(np.hypot(j0, j45))
     rows.append(
-        _row(
+        row(
             *("published", "toric, at cornea", f"1.5 dpt: {found:.3f}", times_ms),
             *("dpt", found - plane["at_cornea_dpt"], plane["source"]),
         )
@@ -378,11 +377,41 @@ def toric_rows() -> list[Row]:
 
 def people_rows() -> list[Row]:
     """Return rows of what people read, beside what ours let them."""
-    found, times_ms = _timed(lambda: list(found_in_people()))
-    return [
-        _row("people", case, setting, times_ms, name, error, source)
-        for case, setting, name, error, source in found
-    ]
+    rows: list[Row] = []
+
+    def add(case, setting, name, found, expected, source, times_ms) -> None:
+        text = f"{setting}: {found:.2f}"
+        error = found - expected
+        rows.append(row("people", case, text, times_ms, name, error, source))
+
+    table = TABLES["edof"]
+    objects_dpt = np.arange(0.0, table["flat_to_dpt"] + 0.1, 0.25)
+    flat, times_ms = _timed(lambda: read_through_focus(objects_dpt))
+    source, to = table["source"], f"to {table['flat_to_dpt']:g} dpt"
+    for name, found in (("best", flat.min()), ("worst", flat.max())):
+        expected = table[f"{name}_log_mar"]
+        add("Symfony", f"{name} {to}", "logMAR", found, expected, source, times_ms)
+    for dpt, expected in table["log_mar_by_dpt"].items():
+        found, times_ms = _timed(lambda dpt=dpt: read_through_focus([float(dpt)])[0])
+        add("Symfony", f"at {dpt} dpt", "logMAR", found, expected, source, times_ms)
+    table = TABLES["lenslets"]
+    lost, times_ms = _timed(lost_by_lenslets)
+    for name, key, found in zip(
+        ("logMAR", "log contrast"),
+        ("lost_log_mar", "lost_log_contrast"),
+        lost,
+        strict=True,
+    ):
+        for side, expected in table[key].items():
+            setting = f"{name} lost, {side} gaze"
+            add("DIMS", setting, name, found, expected, table["source"], times_ms)
+    table = TABLES["progressive"]
+    width_mm, times_ms = _timed(corridor_width_mm)
+    add(
+        *("progressive", "corridor's width, mm", "mm", width_mm, table["width_mm"]),
+        *(table["source"], times_ms),
+    )
+    return rows
 
 
 def plan_rows() -> list[Row]:
@@ -392,19 +421,32 @@ def plan_rows() -> list[Row]:
     bodies["monofocal"] = {"kind": "iol"}
     bodies["lenslets"] = {"kind": "lenslets", "sphere_dpt": 0.0, "vertex_mm": 12.0}
     for name, body in bodies.items():
+        profile = parse_profile(
+            {"kind": "prescription", "sphere_dpt": 0.0, "correction": body}
+        )
         for eye_model in ("traced", "wavefront"):
-            found, times_ms = _timed(
-                lambda body=body, model=eye_model: list(
-                    planned_and_measured(body, eye_model=model)
+            for width_px, height_px in IMAGES_PX:
+                start_s = time.perf_counter()
+                spec = spec_for(
+                    width_px, height_px, mode="dynamic", eye_model=eye_model
                 )
-            )
-            rows += [
-                _row(
-                    *("plan", name, setting, times_ms, "dB", measured - predicted),
-                    *("exact PSFs at random states", STATES),
+                eye, _ = eye_for_spec(profile, spec)
+                plan = unchecked_plan(eye, spec)
+                times_ms = [1e3 * (time.perf_counter() - start_s)]
+                found_db = mean_db(sampled_errors(eye, spec, plan, count=STATES))
+                planned_db = plan.prediction.interpolation_db
+                setting = (
+                    f"{eye_model}, {width_px}x{height_px}, "
+                    f"{plan.prediction.psf_count} PSFs, "
+                    f"planned for {planned_db:.1f} dB: {found_db:.1f}"
                 )
-                for setting, predicted, measured in found
-            ]
+                rows.append(
+                    row(
+                        *("plan", name, setting, times_ms, "dB"),
+                        *(found_db - planned_db, "exact PSFs at random states"),
+                        n=STATES,
+                    )
+                )
     return rows
 
 
@@ -439,10 +481,11 @@ def kernel_rows() -> list[Row]:
                 per_call=KERNELS,
             )
             rows.append(
-                _row(
+                row(
                     *("kernels", name, f"{pupil_mm:g} mm, 1 mrad, one thread"),
                     *([median_ms, p95_ms], "modulation", kernel_error(name, pupil_mm)),
-                    *("true profile, FFT", KERNELS),
+                    "true profile, FFT",
+                    n=KERNELS,
                 )
             )
     return rows
@@ -467,22 +510,10 @@ def kernel_error(name: str, pupil_mm: float) -> float:
     return float(np.abs(found - true).max())
 
 
-def main() -> None:
-    """Run, print, and write results/corrections.json and the picture."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true", help="closed forms, one pupil")
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
-    options = parser.parse_args()
+def measure(run: Run) -> list[Row]:
+    """Return all rows, or closed forms and those of one pupil."""
+    pupils_mm = PUPILS_MM[1:2] if run.is_quick else PUPILS_MM
     rows = closed_form_rows() + toric_rows()
-    pupils_mm = (3.0,) if options.quick else PUPILS_MM
     rows += diffraction_rows(pupils_mm) + lenslet_rows(pupils_mm)
-    published, curves = transfer_rows()
-    rows += published + distance_rows() + people_rows()
-    if not options.quick:
-        rows += kernel_rows() + plan_rows()
-        draw_lenses(RESULTS / "corrections.png", THROUGH_FOCUS_DPT, curves)
-    publish("corrections", rows, as_json=options.json, is_whole=not options.quick)
-
-
-if __name__ == "__main__":
-    main()
+    rows += transfer_rows() + distance_rows() + people_rows()
+    return rows if run.is_quick else rows + kernel_rows() + plan_rows()

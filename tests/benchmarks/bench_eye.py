@@ -1,7 +1,5 @@
 """Time and error of the methods of `Eye`, against sums over the pupil and closed forms.
 
-    python -m tests.benchmarks.bench_eye [--quick] [--json]
-
 - ``psf``: share of the light that is displaced, in discs of 25 arcmin.
 - ``otf``: largest difference at 2 to 40 cycles per degree, in two orientations.
 - ``mtf, 3 pupils``: `Eye.mtf` of 3, 4 and 5 mm, first call (the eye is estimated and
@@ -12,19 +10,18 @@
 - ``isetbio``: share of the light displaced from PSFs that ISETBio published, and from
   the sum over the pupil.  ISETBio's come from 37 points across 3 mm: the same sum over
   these points differs from them by 9e-5 (`tests/numerical/test_image_quality.py`).
-
-Writes results/eye.json.
 """
 
-import argparse
 import time
+from functools import partial
 
 import numpy as np
 
 from estimator import Eye, perfect_transfer
 from estimator.acuity.transfer import neural_sensitivity
 from estimator.optics.zernike import nm_from_index
-from tests.benchmarks.harness import Row, memory_mb, publish
+from tests.benchmarks.harness import Row, Run
+from tests.benchmarks.rows import timed_row
 from tests.isetbio_psfs import moved_light, published_psfs
 from tests.reference import pupil_sums
 
@@ -38,6 +35,8 @@ EYES = ("emmetropia", "myopia", "keratoconus")
 CPD = np.array([2.0, 5.0, 10.0, 20.0, 40.0])
 REPEATS = 5
 SUMS = "sum over the pupil"
+MINUTES = 1
+row = partial(timed_row, "eye")
 
 
 def timed(function):
@@ -48,15 +47,6 @@ def timed(function):
         function()
         times_ms.append(1e3 * (time.perf_counter() - start_s))
     return found, times_ms
-
-
-def row(method, case, setting, times_ms, name, error, reference):
-    """Return one row."""
-    median_ms, p95_ms = np.percentile(times_ms, (50, 95)).tolist()
-    return Row(
-        *("eye", method, case, setting, len(times_ms), median_ms, p95_ms, memory_mb()),
-        *(name, float(error), reference),
-    )
 
 
 def pupil_rows(quick):
@@ -234,17 +224,7 @@ def isetbio_psf(published):
     return found / found.sum(), eye, state, times_ms
 
 
-def main() -> None:
-    """Run, print, and write results/eye.json."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true", help="one eye and pupil")
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
-    options = parser.parse_args()
-    rows = pupil_rows(options.quick) + closed_form_rows() + acuity_rows()
-    if not options.quick:
-        rows += isetbio_rows()
-    publish("eye", rows, as_json=options.json, is_whole=not options.quick)
-
-
-if __name__ == "__main__":
-    main()
+def measure(run: Run) -> list[Row]:
+    """Return all rows, or those of one eye and pupil."""
+    rows = pupil_rows(run.is_quick) + closed_form_rows() + acuity_rows()
+    return rows if run.is_quick else rows + isetbio_rows()

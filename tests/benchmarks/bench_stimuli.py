@@ -1,7 +1,5 @@
 """Stimuli: time to draw them, their sizes in the pixels, and a set seen by people.
 
-    python -m tests.benchmarks.bench_stimuli [--quick] [--json]
-
 - ``letters``: heights of straight-ended letters, as the ink of each row, less the
   heights that were asked for, in percent; the largest of 12 heights from 5 to 60 arcmin
   and of 3 sizes of pixels.
@@ -13,11 +11,8 @@
   render tolerances 0 (default of the command) and 1.
 - ``set``: 10 stimuli, 20 drawn persons and 2 pupils by one command, and the number of
   frames that report a limit of blur (`blur_limited`).
-
-Writes results/stimuli.json.
 """
 
-import argparse
 import json
 import math
 import tempfile
@@ -27,7 +22,8 @@ from pathlib import Path
 import numpy as np
 
 from ocufilter import Eye, EyeFilter, stimuli
-from tests.benchmarks.harness import Row, memory_mb, publish
+from tests.benchmarks.harness import Row, Run
+from tests.benchmarks.rows import timed_row
 from tests.commands import run_command
 from tests.numerical.test_stimuli import (
     AREAS,
@@ -38,6 +34,7 @@ from tests.numerical.test_stimuli import (
     seen_and_expected,
 )
 
+MINUTES = 1
 PIXELS_ARCMIN = (0.25, 0.37, 0.5)
 HEIGHTS_ARCMIN = np.linspace(5.0, 60.0, 12).tolist()
 SIDE_PX = 256
@@ -51,11 +48,8 @@ SET = (
 
 
 def _row(method, case, times_s, name, error, reference) -> Row:
-    median_ms, p95_ms = (1e3 * np.percentile(times_s, (50, 95))).tolist()
-    return Row(
-        *("stimuli", method, case, f"{SIDE_PX}x{SIDE_PX}", len(times_s)),
-        *(median_ms, p95_ms, memory_mb(), name, float(error), reference),
-    )
+    times_ms, size = 1e3 * np.array(times_s), f"{SIDE_PX}x{SIDE_PX}"
+    return timed_row("stimuli", method, case, size, times_ms, name, error, reference)
 
 
 def _sizes(draw, measure, heights_arcmin) -> tuple[list[float], float]:
@@ -186,19 +180,10 @@ def set_row(people: int) -> Row:
     return _row("set", case, [took_s / len(frames)], "false_alarms", alarms, "0")
 
 
-def main() -> None:
-    """Run, print, and write results/stimuli.json."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true", help="few sizes and persons")
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
-    options = parser.parse_args()
-    heights = HEIGHTS_ARCMIN[3:4] if options.quick else HEIGHTS_ARCMIN
-    frequencies = (8.0,) if options.quick else (2.0, 5.5, 12.0, 30.0, 55.0)
+def measure(run: Run) -> list[Row]:
+    """Return the rows of all kinds, or of few sizes and persons."""
+    heights = HEIGHTS_ARCMIN[3:4] if run.is_quick else HEIGHTS_ARCMIN
+    frequencies = (8.0,) if run.is_quick else (2.0, 5.5, 12.0, 30.0, 55.0)
     rows = size_rows(heights) + grating_rows(frequencies)
-    rows += seen_rows((12.0,) if options.quick else (4.0, 8.0, 12.0, 20.0))
-    rows.append(set_row(2 if options.quick else 20))
-    publish("stimuli", rows, as_json=options.json, is_whole=not options.quick)
-
-
-if __name__ == "__main__":
-    main()
+    rows += seen_rows((12.0,) if run.is_quick else (4.0, 8.0, 12.0, 20.0))
+    return [*rows, set_row(2 if run.is_quick else 20)]

@@ -1,7 +1,5 @@
 """The same person before and after: what stays, and the refraction that remains.
 
-    python -m tests.benchmarks.bench_surgery [--quick] [--json]
-
 - ``stays``: largest change of length, K (not of a laser) and the phase of the periphery
   at 25 deg, from the eye without to the eye with the correction.  Goal: 0.
 - ``refraction``: largest difference of sphere-equivalent, J0 and J45 through 4 mm from
@@ -12,11 +10,11 @@
 - ``pseudophakic``: refraction of an eye of that kind, whose power was solved from its
   biometry, less the residual, in the plane of the pupil.
 
-Times are those of an eye, estimated and operated.  Writes results/surgery.json.
+Times are those of an eye, estimated and operated.
 """
 
-import argparse
 import time
+from functools import partial
 
 import numpy as np
 from scipy.optimize import brentq
@@ -28,9 +26,11 @@ from estimator.field.field_table import field_table
 from estimator.field.traced_fields import peripheral_residual
 from estimator.optics.prescription import Prescription
 from estimator.profiles.parse import parse_profile
-from tests.benchmarks.harness import Row, memory_mb, publish
+from tests.benchmarks.harness import Row, Run
+from tests.benchmarks.rows import timed_row
 from tests.numerical.iol_formulas import FORMULAS
 
+MINUTES = 1
 PERSONS = {
     "myope, 68": {"kind": "prescription", "sphere_dpt": -2.5, "age_years": 68},
     "astigmat, 30": {
@@ -57,17 +57,10 @@ CORRECTIONS = {
     "laser": {"kind": "laser"},
 }
 SURGERIES = [name for name in CORRECTIONS if name.startswith(("implant", "laser"))]
+row = partial(timed_row, "surgery")
 SPHERES_DPT = (-6.0, -3.0, 2.0, 4.0)
 NODES_DEG = np.linspace(-30.0, 30.0, 5), np.zeros(1)
 AT_DEG = np.array([-25.0, 25.0]), np.zeros(2)
-
-
-def _row(method, case, setting, times_ms, name, error, reference) -> Row:
-    median_ms, p95_ms = np.percentile(times_ms, (50, 95)).tolist()
-    return Row(
-        *("surgery", method, case, setting, len(times_ms), median_ms, p95_ms),
-        *(memory_mb(), name, float(error), reference),
-    )
 
 
 def _timed_eye(body: dict):
@@ -95,7 +88,7 @@ def _stays_rows(person: str, body: dict, names: list[str]) -> list[Row]:
         if name == "laser":
             del changes["K, dpt"]
         rows += [
-            _row("stays", person, name, [time_ms], what, abs(change), "before")
+            row("stays", person, name, [time_ms], what, abs(change), "before")
             for what, change in changes.items()
         ]
     return rows
@@ -124,7 +117,7 @@ def _refraction_rows(person: str, body: dict, names: list[str]) -> list[Row]:
         )
         error_dpt = np.abs(found - wanted).max()
         rows.append(
-            _row("refraction", person, name, [time_ms], "dpt", error_dpt, "residual")
+            row("refraction", person, name, [time_ms], "dpt", error_dpt, "residual")
         )
     return rows
 
@@ -161,7 +154,7 @@ def formula_rows(spheres_dpt: tuple[float, ...]) -> list[Row]:
             expected_dpt = power_dpt(*numbers[:2], lens_mm + constant_mm)
             error_dpt = found.power_dpt - expected_dpt
             rows.append(
-                _row("formula", f"{sphere_dpt:+g} dpt", name, [time_ms], "dpt of the "
+                row("formula", f"{sphere_dpt:+g} dpt", name, [time_ms], "dpt of the "
                      "implant", error_dpt, name)
             )  # fmt: skip
     return rows
@@ -182,27 +175,17 @@ def pseudophakic_rows(lengths_mm: tuple[float, ...]) -> list[Row]:
         eye, time_ms = _timed_eye(body)
         error_dpt = eye.refraction_dpt + 0.5
         rows.append(
-            _row("pseudophakic", f"{length_mm:g} mm", "residual -0.5 dpt", [time_ms],
+            row("pseudophakic", f"{length_mm:g} mm", "residual -0.5 dpt", [time_ms],
                  "dpt", error_dpt, "residual")
         )  # fmt: skip
     return rows
 
 
-def main() -> None:
-    """Run, print, and write results/surgery.json."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true", help="one person, few powers")
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
-    options = parser.parse_args()
-    count = 1 if options.quick else len(PERSONS)
+def measure(run: Run) -> list[Row]:
+    """Return the rows of all persons and powers, or of a few."""
     rows = []
-    for person, body in list(PERSONS.items())[:count]:
+    for person, body in list(PERSONS.items())[: 1 if run.is_quick else None]:
         rows += _stays_rows(person, body, [*CORRECTIONS])
         rows += _refraction_rows(person, body, SURGERIES)
-    rows += formula_rows(SPHERES_DPT[:1] if options.quick else SPHERES_DPT)
-    rows += pseudophakic_rows((23.5,) if options.quick else (22.0, 23.5, 26.0))
-    publish("surgery", rows, as_json=options.json, is_whole=not options.quick)
-
-
-if __name__ == "__main__":
-    main()
+    rows += formula_rows(SPHERES_DPT[:1] if run.is_quick else SPHERES_DPT)
+    return rows + pseudophakic_rows((23.5,) if run.is_quick else (22.0, 23.5, 26.0))

@@ -1,7 +1,5 @@
 """Eyes drawn from SyntEyes, compared with its data, visisipy and measured people.
 
-    python -m tests.benchmarks.bench_synteyes [--quick] [--json]
-
 - ``biometry``: means, deviations and correlations of 1,000 drawn eyes less those of
   200,000 eyes that visisipy draws, in units of their sampling error; the time is that
   of parsing a profile, with its eye.
@@ -13,14 +11,12 @@
   length, as in visisipy.
 - ``higher orders``: mean terms through 5 mm less those of these eyes, and mean RMS less
   that of 2,560 eyes by pupil; with and without the higher orders of the lens.
-
-Writes results/synteyes.json.
 """
 
-import argparse
 import json
 import time
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +35,8 @@ from estimator.profiles.synteyes import (
 )
 from estimator.wavefront.aberrations import on_axis_zernike
 from tests import human_data
-from tests.benchmarks.harness import Row, memory_mb, publish
+from tests.benchmarks.harness import Row, Run
+from tests.benchmarks.rows import timed_row
 
 FROZEN = Path(__file__).parents[1] / "data" / "visisipy_synteyes.json"
 NAMES = (
@@ -47,19 +44,13 @@ NAMES = (
     *("lens_anterior_radius_mm", "lens_posterior_radius_mm", "lens_power_dpt"),
     "keratometry_dpt",
 )
-N_DRAWN = 1000
+N_DRAWN, QUICK_DRAWN = 1000, 50
+row = partial(timed_row, "synteyes")
+MINUTES = 1
 WAVELENGTH_NM = 555.0
 RETINA_MM = 0.2
 LENS = 2
 DPT_PER_C20 = -4.0 * np.sqrt(3.0)
-
-
-def _row(method, case, setting, n, times_ms, name, error, reference) -> Row:
-    median_ms, p95_ms = np.percentile(times_ms, (50, 95)).tolist()
-    return Row(
-        *("synteyes", method, case, setting, n, median_ms, p95_ms, memory_mb()),
-        *(name, float(error), reference),
-    )
 
 
 def traced_um(eyes: list[EyeSurfaces], pupil_mm: float) -> NDArray[np.float64]:
@@ -101,8 +92,8 @@ def biometry_rows(
             ("deviation", values.std() - deviation, deviation / (2.0 * n) ** 0.5),
         ):
             rows.append(
-                _row(
-                    *("biometry", name, f"{what}: {told}", n, times_ms),
+                row(
+                    *("biometry", name, f"{what}: {told}", times_ms),
                     *("sampling errors", error / size, reference),
                 )
             )
@@ -111,8 +102,8 @@ def biometry_rows(
     size = np.maximum((1.0 - ratio**2) / n**0.5, 1e-4)
     away = ((np.corrcoef(found) - ratio) / size)[above]
     rows.append(
-        _row(
-            *("biometry", f"{away.size} correlations", "largest", n, times_ms),
+        row(
+            *("biometry", f"{away.size} correlations", "largest", times_ms),
             *("sampling errors", np.abs(away).max(), reference),
         )
     )
@@ -139,8 +130,8 @@ def visisipy_rows(expected: dict[str, Any]) -> list[Row]:
             times_ms.append(1e3 * (time.perf_counter() - start_s))
             away.append(np.abs(rays.points_mm[:, -1] - eye[case]).max())
         rows.append(
-            _row(
-                *("visisipy", case, "largest on the retina", len(away), times_ms),
+            row(
+                *("visisipy", case, "largest on the retina", times_ms),
                 *("um", 1e3 * max(away), "optiland"),
             )
         )
@@ -166,9 +157,10 @@ def refraction_rows(eyes: list[EyeSurfaces]) -> list[Row]:
             ("skewness of M", skewness, human_data.ROZEMA_M_SKEWNESS),
         ):
             rows.append(
-                _row(
+                row(
                     *("refraction", case, f"{found:.3f}, measured {expected:.3f}"),
-                    *(len(used), times_ms, what, found - expected, reference),
+                    *(times_ms, what, found - expected, reference),
+                    n=len(used),
                 )
             )
     return rows
@@ -188,9 +180,10 @@ def higher_order_rows(eyes: list[EyeSurfaces]) -> list[Row]:
             rms_um = np.linalg.norm(found_um[:, 6:], axis=1).mean()
             told = f"RMS, {pupil_mm:g} mm: {rms_um:.3f} um, measured {expected_um:.3f}"
             rows.append(
-                _row(
-                    *("higher orders", case, told, len(used), times_ms),
+                row(
+                    *("higher orders", case, told, times_ms),
                     *("um", rms_um - expected_um, "Salmon & van de Pol 2006"),
+                    n=len(used),
                 )
             )
             if pupil_mm != human_data.ROZEMA_PUPIL_MM:
@@ -199,37 +192,29 @@ def higher_order_rows(eyes: list[EyeSurfaces]) -> list[Row]:
                 term_um = found_um[:, index_from_nm(n, m)].mean()
                 told = f"C({n},{m}): {term_um:+.3f} um, measured {mean_um:+.3f}"
                 rows.append(
-                    _row(
-                        *("higher orders", case, told, len(used), times_ms),
+                    row(
+                        *("higher orders", case, told, times_ms),
                         *("um", term_um - mean_um, "Rozema et al. 2017"),
+                        n=len(used),
                     )
                 )
     return rows
 
 
-def main() -> None:
-    """Run, print, and write results/synteyes.json."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true", help="50 eyes")
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
-    options = parser.parse_args()
+def measure(run: Run) -> list[Row]:
+    """Return the rows of 1,000 eyes, or of 50."""
     expected = json.loads(FROZEN.read_text(encoding="utf-8"))
     drawn, times_ms = [], []
     parse_profile({"kind": "synteyes", "sample": 0})  # reads the coefficients
-    for sample in range(50 if options.quick else N_DRAWN):
+    for sample in range(QUICK_DRAWN if run.is_quick else N_DRAWN):
         start_s = time.perf_counter()
         parse_profile({"kind": "synteyes", "sample": sample})
         times_ms.append(1e3 * (time.perf_counter() - start_s))
         drawn.append(drawn_biometry(sample))
     eyes = [eye_of_biometry(biometry, eye_side="OD") for biometry in drawn]
-    rows = [
+    return [
         *biometry_rows(drawn, times_ms, expected),
         *visisipy_rows(expected),
         *refraction_rows(eyes),
         *higher_order_rows(eyes),
     ]
-    publish("synteyes", rows, as_json=options.json, is_whole=not options.quick)
-
-
-if __name__ == "__main__":
-    main()
