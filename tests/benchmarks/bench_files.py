@@ -1,7 +1,5 @@
 """Malformed files: time and memory to read them, and the errors reported.
 
-    python -m tests.benchmarks.bench_files [--quick] [--json]
-
 Valid files of all kinds that are read - pictures, depth, arrays, OpenEXR, profiles,
 lens files, spectra, lists, calibrations, states, manifests, videos, glTF, stored eyes,
 configurations, keys, links of the page, data sets - are changed: bytes flipped, cut,
@@ -11,10 +9,9 @@ drawn from the JSON Schema.  100,000 are read by processes of their own, and 500
 to `ocufilter` as a program.  Errors: of readers, what is raised beside the documented
 errors and what libraries write to stderr; of the program, an exit code that is
 neither 2 with one line on stderr nor 0; of all, processes that die, the longest read
-in s of the processor and the most memory in MB.  Writes results/files.json.
+in s of the processor and the most memory in MB.
 """
 
-import argparse
 import json
 import logging
 import os
@@ -26,14 +23,17 @@ import time
 from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from threading import Timer
 
 import numpy as np
 
-from tests.benchmarks.harness import ROOT, Row, publish
+from tests.benchmarks.harness import ROOT, Row, Run
+from tests.benchmarks.rows import timed_row
 from tests.file_mutants import Kind, kinds, mutant
 
 N_READS, N_COMMANDS = 100_000, 500
-QUICK_READS, QUICK_COMMANDS = 1_500, 6
+QUICK_READS, QUICK_COMMANDS = 250, 4
+MINUTES = 35
 N_PROCESSES = 2
 COMMAND_S = 60.0
 MAX_READ_S, MAX_MEMORY_MB = 5.0, 1000.0
@@ -123,7 +123,7 @@ class Reads:
 
     def _run_process(self, first: int, count: int, folder: str) -> int:
         command = [
-            *(sys.executable, "-m", "tests.benchmarks.bench_files", "--read"),
+            *(sys.executable, "-m", "tests.benchmarks.bench_files"),
             *(self.kind.name, str(first), str(count), folder),
         ]
         done = subprocess.run(command, cwd=ROOT, stdout=subprocess.PIPE, text=True)
@@ -154,16 +154,14 @@ class Reads:
     def rows(self) -> list[Row]:
         """Return them as rows."""
         setting = f"{self.raised[REFUSED]} refused, {self.raised[VALID]} valid"
-        values = (
-            ("wrong answers", len(self.wrong)),
-            ("longest read, s", self.longest_s),
-            ("peak memory, MB", self.peak_mb),
-        )
+        errors = {
+            "wrong answers": len(self.wrong),
+            "longest read, s": self.longest_s,
+            "peak memory, MB": self.peak_mb,
+        }
         times_ms = 1e3 * np.array(self.times_s or [0.0])
-        return [
-            _row("reads", self.kind.name, setting, times_ms, self.peak_mb, *value)
-            for value in values
-        ]
+        case = self.kind.name
+        return rows_of("reads", case, setting, times_ms, self.peak_mb, errors)
 
 
 # --- commands --------------------------------------------------------------------
@@ -211,10 +209,8 @@ def run_commands(kinds_: list[Kind], count: int, folder: Path) -> list[Row]:
         print(f"ocufilter: {text}", file=sys.stderr)
     codes = Counter(text for _, _, text in ran)
     setting = f"{codes['2']} refused, {codes['0']} done"
-    return [
-        _row("ocufilter", "a process each", setting, times_ms, peak_mb, *value)
-        for value in (("wrong answers", len(wrong)), ("peak memory, MB", peak_mb))
-    ]
+    errors = {"wrong answers": len(wrong), "peak memory, MB": peak_mb}
+    return rows_of("ocufilter", "a process each", setting, times_ms, peak_mb, errors)
 
 
 def _run_command(label: str, arguments: list[str]) -> tuple[float, float, str]:
@@ -227,7 +223,8 @@ def _run_command(label: str, arguments: list[str]) -> tuple[float, float, str]:
         stdout=subprocess.DEVNULL,
         stderr=subprocess.PIPE,
     )
-    timer = _killed_after(process, COMMAND_S)
+    timer = Timer(COMMAND_S, process.kill)
+    timer.start()
     said = process.stderr.read().decode("utf-8", "replace")
     process.stderr.close()
     _, status, usage = os.wait4(process.pid, 0)
@@ -240,43 +237,32 @@ def _run_command(label: str, arguments: list[str]) -> tuple[float, float, str]:
     return took_s, peak_mb, str(code)
 
 
-def _killed_after(process: subprocess.Popen, limit_s: float):
-    from threading import Timer
-
-    timer = Timer(limit_s, process.kill)
-    timer.start()
-    return timer
-
-
 # --- rows ------------------------------------------------------------------------
 
 
-def _row(
+def rows_of(
     method: str,
     case: str,
     setting: str,
     times_ms: np.ndarray,
     memory_mb: float,
-    error_name: str,
-    error: float,
-) -> Row:
-    return Row(
-        bench="files",
-        method=method,
-        case=case,
-        setting=setting,
-        n=len(times_ms),
-        median_ms=float(np.median(times_ms)),
-        p95_ms=float(np.percentile(times_ms, 95)),
-        memory_mb=float(memory_mb),
-        error_name=error_name,
-        error=float(error),
-        reference=REFERENCE,
-    )
+    errors: dict[str, float],
+) -> list[Row]:
+    """Return a row for each error."""
+    return [
+        timed_row(
+            *("files", method, case, setting, times_ms, name, error, REFERENCE),
+            mb=memory_mb,
+        )
+        for name, error in errors.items()
+    ]
 
 
-def measure(n_reads: int, n_commands: int) -> list[Row]:
+def measure(run: Run) -> list[Row]:
     """Return the rows of all kinds, of all together, and of the program."""
+    n_reads, n_commands = N_READS, N_COMMANDS
+    if run.is_quick:
+        n_reads, n_commands = QUICK_READS, QUICK_COMMANDS
     with tempfile.TemporaryDirectory(dir=TEMPORARY) as name:
         folder = Path(name)
         every = kinds(folder)
@@ -289,33 +275,16 @@ def measure(n_reads: int, n_commands: int) -> list[Row]:
                 print(f"{one.kind.name} {text}", file=sys.stderr)
         rows = [row for one in reads for row in one.rows()]
         times_ms = 1e3 * np.array([t for one in reads for t in one.times_s])
-        peak_mb = max(one.peak_mb for one in reads)
-        rows += [
-            _row("reads", "all", f"{len(reads)} kinds", times_ms, peak_mb, *value)
-            for value in (
-                ("wrong answers", sum(len(one.wrong) for one in reads)),
-                ("longest read, s", max(one.longest_s for one in reads)),
-                ("peak memory, MB", peak_mb),
-            )
-        ]
+        errors = {
+            "wrong answers": sum(len(one.wrong) for one in reads),
+            "longest read, s": max(one.longest_s for one in reads),
+            "peak memory, MB": max(one.peak_mb for one in reads),
+        }
+        peak_mb, setting = errors["peak memory, MB"], f"{len(reads)} kinds"
+        rows += rows_of("reads", "all", setting, times_ms, peak_mb, errors)
         return rows + run_commands(every, n_commands, folder)
 
 
-def main() -> None:
-    """Run, print, and write results/files.json."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true", help="1,500 reads")
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
-    parser.add_argument("--read", nargs=4, help=argparse.SUPPRESS)
-    options = parser.parse_args()
-    if options.read:
-        name, first, count, folder = options.read
-        read_some(name, int(first), int(count), Path(folder))
-        return
-    counts = (QUICK_READS, QUICK_COMMANDS) if options.quick else (N_READS, N_COMMANDS)
-    rows = measure(*counts)
-    publish("files", rows, as_json=options.json, is_whole=not options.quick)
-
-
-if __name__ == "__main__":
-    main()
+if __name__ == "__main__":  # a process that reads; see `Reads`
+    kind_name, first, count, folder = sys.argv[1:]
+    read_some(kind_name, int(first), int(count), Path(folder))

@@ -1,8 +1,7 @@
 r"""Stages of a headset frame, filtered in process and by a service.
 
-    python -m tests.benchmarks.bench_headset [--quick] [--json] [--sizes WxH ...]
     sh tests/headset/run_in_root.sh env OCUFILTER_COMMIT=$(git rev-parse --short HEAD) \
-        python -m tests.benchmarks.bench_headset --openxr
+        python -m tests.benchmarks headset --openxr --json
 
 The viewer of `ocufilter headset` in a simulated headset of 72 Hz whose head moves: the
 courtyard through a myope's left and a keratoconic right eye, natural focus and pupils.
@@ -15,15 +14,14 @@ frame's begin to where it was shown.  "here, textures": as `ocufilter headset
 --textures`, where ``filter`` is the time of the calls.
 
 With --openxr, in the root of tests/headset: the same in Monado, with its compositor on
-the processor too, before a striped wall; prints JSON.
+the processor too, before a striped wall.
 
 The error is the peak signal-to-noise ratio, of 8 bits, of the last pictures to the same
-frame filtered with no tolerance for errors of rendering.  Writes results/headset.json.
+frame filtered with no tolerance for errors of rendering.
 """
 
-import argparse
 import contextlib
-import json
+import os
 import tempfile
 import time
 from pathlib import Path
@@ -42,8 +40,10 @@ from clients.scenes.scene_view import read_texture
 from clients.service_process import ServiceProcess
 from filter_service import FilterSettings
 from filter_service.errors import FilterError
-from tests.benchmarks.harness import KeptRows, Row, memory_mb, publish, report
+from tests.benchmarks.harness import KeptRows, Row, Run
+from tests.benchmarks.rows import timed_row
 
+MINUTES = 6
 SIZES_PX = ((448, 504), (896, 1007))
 QUICK_SIZES_PX = ((112, 126),)
 N_FRAMES, QUICK_FRAMES = 80, 5
@@ -81,17 +81,6 @@ class Watched:
         self._seeing.close()
 
 
-def viewer_of(open_runtime, scenery, seeing):
-    return Viewer(
-        open_runtime,
-        scenery,
-        seeing,
-        StereoGaze(age_years=30.0),
-        Controls(dict(PROFILES), seeing.change),
-        say=lambda line: None,
-    )
-
-
 def error_db(seen, context) -> float:
     """Return the PSNR of what was seen to the same frame without tolerance."""
     with context:
@@ -122,18 +111,28 @@ def error_db(seen, context) -> float:
         exact.close()
 
 
-def run(open_runtime, scenery, seeing, n_frames: int):
+def watched_run(open_runtime, scenery, seeing, n_frames: int):
     """Warm up until both eyes are whole, then measure: log, last frame, seconds."""
     watched = Watched(seeing)
     for eye, profile in PROFILES.items():
         watched.change(eye, profile)
-    viewer = viewer_of(open_runtime, scenery, watched)
-    end_s = time.monotonic() + WARM_S
+
+    def viewer_of() -> Viewer:
+        return Viewer(
+            open_runtime,
+            scenery,
+            watched,
+            StereoGaze(age_years=30.0),
+            Controls(dict(PROFILES), watched.change),
+            say=lambda line: None,
+        )
+
+    viewer, end_s = viewer_of(), time.monotonic() + WARM_S
     n_whole = 0
     while time.monotonic() < end_s and n_whole < 5:
         viewer.run(max_frames=viewer.log.n_filtered + 1, limit_s=WARM_S)
         n_whole = n_whole + 1 if watched.last and watched.last.is_complete else 0
-    viewer = viewer_of(open_runtime, scenery, watched)
+    viewer = viewer_of()
     start_s = time.monotonic()
     log = viewer.run(max_frames=n_frames, limit_s=WARM_S)
     return log, watched.last, time.monotonic() - start_s
@@ -142,11 +141,9 @@ def run(open_runtime, scenery, seeing, n_frames: int):
 def rows_of(log, took_s: float, method: str, case: str, error: float):
     dropped = f"{log.n_filtered / took_s:.1f} Hz, {log.n_repeated} shown again"
     for name, values in log.stages_ms.items():
-        median_ms, p95_ms = np.percentile(values, (50, 95)).tolist()
-        yield Row(
+        yield timed_row(
             *("headset", f"{method}: {name.removesuffix('_ms')}", case, dropped),
-            *(len(values), median_ms, p95_ms, memory_mb()),
-            *("psnr_db", error, "no tolerance"),
+            *(values, "psnr_db", error, "no tolerance"),
         )
 
 
@@ -167,7 +164,7 @@ def ways(context):
             yield name, seeing
 
 
-def measure(sizes_px, n_frames: int) -> list[Row]:
+def simulated_rows(sizes_px, n_frames: int) -> list[Row]:
     """Return the rows of a simulated headset."""
     scene = build_scene("courtyard")
     stand = upright(viewpoint(scene))
@@ -182,7 +179,7 @@ def measure(sizes_px, n_frames: int) -> list[Row]:
     with contextlib.closing(SceneScenery(context, scene, stand)) as scenery:
         for size_px in sizes_px:
             for name, seeing in ways(context):
-                log, seen, took_s = run(
+                log, seen, took_s = watched_run(
                     lambda size_px=size_px: SimulatedRuntime(
                         size_px, rate_hz=RATE_HZ, finish=finish
                     ),
@@ -198,10 +195,8 @@ def measure(sizes_px, n_frames: int) -> list[Row]:
     return rows
 
 
-def measure_openxr(n_frames: int) -> list[Row]:
+def openxr_rows(n_frames: int) -> list[Row]:
     """Return the rows of Monado."""
-    import os
-
     from clients.headset.openxr_runtime import OpenXrRuntime
     from tests.headset.monado import Monado
     from tests.headset.rooms import stripes
@@ -220,7 +215,7 @@ def measure_openxr(n_frames: int) -> list[Row]:
                 stack.callback(context.release)
                 stack.callback(scenery.close)
                 for name, seeing in ways(context):
-                    log, seen, took_s = run(
+                    log, seen, took_s = watched_run(
                         lambda context=context: OpenXrRuntime(context),
                         scenery,
                         seeing,
@@ -239,26 +234,19 @@ def size_of(text: str) -> tuple[int, int]:
     return int(width_px), int(height_px)
 
 
-def main() -> None:
-    """Measure, print, write."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--quick", action="store_true", help="small, five frames")
+def options(parser) -> None:
+    """Add the options of this benchmark."""
     parser.add_argument("--openxr", action="store_true", help="in Monado; see above")
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
     parser.add_argument("--sizes", nargs="+", type=size_of, metavar="WxH")
-    arguments = parser.parse_args()
-    sizes_px = QUICK_SIZES_PX if arguments.quick else arguments.sizes or SIZES_PX
-    n_frames = QUICK_FRAMES if arguments.quick else N_FRAMES
+
+
+def measure(run: Run) -> list[Row]:
+    """Return the rows of a simulated headset, or of Monado."""
+    n_frames = QUICK_FRAMES if run.is_quick else N_FRAMES
+    sizes_px = QUICK_SIZES_PX if run.is_quick else run.options.sizes or SIZES_PX
     try:
-        if arguments.openxr:
-            print(json.dumps(report(measure_openxr(n_frames)), indent=1))
-            return
-        rows = measure(sizes_px, n_frames)
+        if run.options.openxr:
+            return openxr_rows(n_frames)
+        return simulated_rows(sizes_px, n_frames)
     except FilterError as error:
         raise SystemExit(f"headset: {error}") from None
-    is_whole = sizes_px == SIZES_PX
-    publish("headset", rows, as_json=arguments.json, is_whole=is_whole)
-
-
-if __name__ == "__main__":
-    main()

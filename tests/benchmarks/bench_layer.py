@@ -1,8 +1,7 @@
 r"""What the OpenXR layer adds to a program's frames, and how old filtered frames are.
 
     sh tests/headset/run_in_root.sh env OCUFILTER_COMMIT=$(git rev-parse --short HEAD) \
-        python -m tests.benchmarks.bench_layer [--quick] \
-        > tests/benchmarks/results/layer.json
+        python -m tests.benchmarks layer
 
 The application of tests/openxr_layer on its mock runtime, at 72 frames a second, with
 depth, in OpenGL and in Vulkan by Mesa on the processor: without the layer; with the
@@ -20,12 +19,9 @@ time to that of the frame in whose place it is shown.
 
 The error is the peak signal-to-noise ratio, of 8 bits, of the last pictures to the same
 frame filtered with no tolerance for errors of rendering; infinite for unfiltered ones.
-Prints JSON.
 """
 
-import argparse
 import contextlib
-import json
 import tempfile
 from pathlib import Path
 
@@ -33,19 +29,23 @@ import numpy as np
 
 from clients.headset.stereo_filter import FilteredStereoFrame, LocalFilter
 from clients.headset.stereo_gaze import StereoGaze
+from tests.benchmarks import harness
 from tests.benchmarks.bench_headset import PROFILES, SETTINGS, error_db
-from tests.benchmarks.harness import Row, memory_mb, report
+from tests.benchmarks.harness import Row, memory_mb
+from tests.benchmarks.rows import timed_row
 from tests.end_to_end.layer_double import RunningHelper
 from tests.openxr_layer import build
 from tests.openxr_layer.layered import layer_environment
 from tests.openxr_layer.programs import Run
 
+MINUTES = 12
 APIS = {"OpenGL": (), "Vulkan": ("--vulkan", "2")}
 SIZES_PX = ((448, 504), (896, 1007))
 QUICK_SIZES_PX = ((112, 126),)
 RATE_HZ = 72
 N_FRAMES, QUICK_FRAMES = 1500, 600
 SETTLED = 0.5  # of the frames, by which eyes are ready
+REFERENCE = "no tolerance for errors of rendering"
 STAGES = ("copy", "read", "upload", "other", "helper")
 
 
@@ -108,23 +108,9 @@ class Bench:
 
     def row(self, method, setting, times_ms, error=float("inf")) -> Row:
         """Return a row of times."""
-        median_ms, p95_ms = np.percentile(times_ms, (50, 95))
-        return self.told_row(method, setting, len(times_ms), median_ms, p95_ms, error)
-
-    def told_row(self, method, setting, n, median_ms, p95_ms, error) -> Row:
-        """Return a row of a median and a percentile."""
-        return Row(
-            bench="layer",
-            method=method,
-            case=self.case,
-            setting=setting,
-            n=n,
-            median_ms=float(median_ms),
-            p95_ms=float(p95_ms),
-            memory_mb=memory_mb(),
-            error_name="PSNR dB",
-            error=error,
-            reference="no tolerance for errors of rendering",
+        return timed_row(
+            *("layer", method, self.case, setting, times_ms),
+            *("PSNR dB", error, REFERENCE),
         )
 
     def copied(self) -> tuple[Run, dict]:
@@ -179,13 +165,17 @@ def stage_rows(bench, method, told, names, error=float("inf")) -> list[Row]:
     rows = []
     for name in names:
         found, n = told["stages_ms"][f"{name}_ms"], told["filtered"]
-        n = n or told["not_filtered"]
-        row = bench.told_row(method, name, n, found["p50"], found["p95"], error)
-        rows.append(row)
+        rows.append(
+            Row(
+                *("layer", method, bench.case, name, n or told["not_filtered"]),
+                *(found["p50"], found["p95"], memory_mb()),
+                *("PSNR dB", error, REFERENCE),
+            )
+        )
     return rows
 
 
-def measure(api: str, size_px: tuple[int, int], n_frames: int) -> list[Row]:
+def rows_of(api: str, size_px: tuple[int, int], n_frames: int) -> list[Row]:
     """Return the rows of one size, in one API."""
     with tempfile.TemporaryDirectory() as folder:
         bench = Bench(Path(folder), api, size_px, n_frames)
@@ -217,21 +207,13 @@ def measure(api: str, size_px: tuple[int, int], n_frames: int) -> list[Row]:
     return rows
 
 
-def main() -> None:
-    """Measure, print."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--quick", action="store_true", help="small, 600 frames")
-    arguments = parser.parse_args()
-    sizes_px = QUICK_SIZES_PX if arguments.quick else SIZES_PX
-    n_frames = QUICK_FRAMES if arguments.quick else N_FRAMES
-    rows = [
+def measure(run: harness.Run) -> list[Row]:
+    """Return the rows of all sizes and interfaces, or of one small size."""
+    sizes_px = QUICK_SIZES_PX if run.is_quick else SIZES_PX
+    n_frames = QUICK_FRAMES if run.is_quick else N_FRAMES
+    return [
         row
         for size_px in sizes_px
         for api in APIS
-        for row in measure(api, size_px, n_frames)
+        for row in rows_of(api, size_px, n_frames)
     ]
-    print(json.dumps(report(rows), indent=1))
-
-
-if __name__ == "__main__":
-    main()

@@ -1,34 +1,27 @@
-"""Peripheral aberrations of people who were held out: prediction error.
-
-    python -m tests.benchmarks.bench_people [--quick] [--json] [--plot] [--people N]
+"""Predicted eyes compared with people: their periphery, modulation, acuity, spread.
 
 129 eyes of 65 people along the horizontal meridian (4 mm), in folds that keep a
-person's eyes together.  Ours is `field_table` of a profile that has the axis alone, or
-the axis and 20 deg to both sides, with the population fitted to the other folds; linear
-predictors are fitted to the same folds.  Five people measured over 40 x 25 deg follow,
-with the shipped population.  Error is the median over eyes of the length of the error
-in (M, J0, J45), dpt, of the change from the axis; beside it stands that of the RMS of
-all terms from the second to the fourth order, um.  Who falls into which fold moves an
-angle's median by some per cent, so ours over the regression on M is drawn `DRAWS` times
-and averaged, with its deviation between draws.
+person's eyes together.  ``people`` is `field_table` of a profile that has the axis
+alone, or the axis and 20 deg to both sides, with the population fitted to the other
+folds; linear predictors are fitted to the same folds.  Error is the median over eyes of
+the length of the error in (M, J0, J45), dpt, of the change from the axis; beside it
+stands that of the RMS of all terms from the second to the fourth order, um.
 
-A second table compares the typical eye of a prescription of 0 dpt, and N persons drawn
-with this prescription, with published measurements of people.  `people_optics` and
+Then the typical eye of a prescription of 0 dpt, and N persons drawn with this
+prescription, are compared with published measurements of people.  `people_optics` and
 `people_vision` define the measures, `tests/human_data.py` contains the sources.  The
-modulation of a group is the mean over its eyes, not that of the mean wavefront.  Then
+modulation of a group is the mean over its eyes, not that of the mean wavefront.
 `people_spread` compares spread, couplings and extremes of drawn persons with those of
-people left out of the population.
-Columns: value of the modeled eyes, published value, difference, change by residual
-refraction, change by scattered light (double pass only), remaining difference, and the
-range of 80 % of the modeled eyes.
+people left out of the population.  The setting of a row has the value of the modeled
+eyes, with the changes by residual refraction and by scattered light (double pass).
 
-Writes results/people.json and results/people_measures.png.
+A whole run draws results/people_measures.png, too.
 """
 
-import argparse
 import itertools
+import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from unittest.mock import patch
 
@@ -37,21 +30,17 @@ from numpy.typing import NDArray
 
 from estimator.field.field_table import field_table
 from estimator.optics.prescription import power_vectors_dpt
-from estimator.optics.units import SPHERE_PER_C20
 from estimator.optics.zernike import N_TERMS, nm_from_index, rescale_pupil
-from estimator.periphery.change import peripheral_change
 from estimator.periphery.population import (
     CIRCLE_MM,
     TERMS,
     MeasuredEyes,
     Population,
     load_measured_eyes,
-    measured_population,
 )
-from estimator.profiles.parse import parse_profile, preset_names
-from filter_service.progress import Progress
-from tests.benchmarks.harness import OUT, RESULTS, Row, memory_mb, publish
-from tests.benchmarks.people_findings import Finding, print_findings
+from estimator.profiles.parse import parse_profile
+from tests.benchmarks.harness import OUT, RESULTS, Row, Run
+from tests.benchmarks.people_findings import Finding
 from tests.benchmarks.people_measures_picture import plot_findings
 from tests.benchmarks.people_modulation import REFRACTIONS
 from tests.benchmarks.people_optics import (
@@ -62,7 +51,6 @@ from tests.benchmarks.people_optics import (
     own_field_findings,
     refraction_findings,
 )
-from tests.benchmarks.people_picture import plot_fields, show_scene
 from tests.benchmarks.people_spread import DRAWS as SPREAD_DRAWS
 from tests.benchmarks.people_spread import PERSONS, spread_findings
 from tests.benchmarks.people_vision import (
@@ -70,19 +58,16 @@ from tests.benchmarks.people_vision import (
     acuity_findings,
     straylight_findings,
 )
-from tests.measured_fields import load_measured_fields
+from tests.benchmarks.rows import timed_row
 
 FILE = Path(__file__).parents[1] / "data" / "peripheral_wavefronts.npz"
 ANGLES_DEG = (-40.0, -30.0, -20.0, -10.0, 10.0, 20.0, 30.0, 40.0)
 """On the retina of a right eye, positive temporal: h = -angle."""
 
 GIVEN_DEG = (-20.0, 20.0)
+MINUTES = 25
 FOLDS, QUICK_FOLDS = 5, 2
 SEED = 0
-DRAWS, QUICK_DRAWS = 6, 1
-"""Of persons into folds, for the ratio of ours to the regression on M."""
-
-REPEATS = 5
 RIDGES = {"M": 1.0, "all central terms": 100.0, "axis and +-20 deg": 10.0}
 """Of standardised inputs; each is the best of 1, 3, 10, 30, 100."""
 
@@ -91,10 +76,8 @@ WAVELENGTH_NM = 555.0
 PEOPLE, QUICK_PEOPLE = 50, 4
 """Drawn persons."""
 
-ACUITY_PEOPLE, QUICK_ACUITY_PEOPLE = 8, 0
+ACUITY_PEOPLE = 8
 """Drawn persons whose acuity is predicted, which takes 0.5 s per value."""
-
-QUICK_PUPILS_MM = (4.0,)
 
 FIELDS, QUICK_FIELDS = 10, 2
 """Peripheries drawn for each measured axis."""
@@ -102,7 +85,7 @@ FIELDS, QUICK_FIELDS = 10, 2
 FIELD_ANGLES_DEG = (-20.0, -10.0, -5.0, 5.0, 10.0, 20.0)
 QUICK_SPREAD_DRAWS, QUICK_PERSONS = 10, 100
 QUICK_STEP = 6
-"""With ``--quick``, every sixth measured eye is used."""
+"""Every sixth measured eye is used."""
 
 
 def profile_of(zernike_um: NDArray, others: dict[float, NDArray] | None = None, **more):
@@ -221,7 +204,7 @@ def median_errors(predicted_um, measured_um) -> tuple[NDArray, NDArray]:
 
 
 def meridian_predictions(
-    judged: Meridian, fold_count: int, task: Callable[[float], None]
+    judged: Meridian, fold_count: int
 ) -> dict[str, tuple[NDArray, float]]:
     """Predictions (n, 8, 12) of each method, and what one of ours takes, ms."""
     shape = judged.change_um.shape
@@ -229,7 +212,7 @@ def meridian_predictions(
     ours = ("people", "people, +-20 deg given", "eye model alone")
     found = {name: np.full(shape, np.nan) for name in (*names, *ours)}
     times_ms = dict.fromkeys(found, 0.0)
-    for k, out in enumerate(folds(judged.people, fold_count)):
+    for out in folds(judged.people, fold_count):
         for name in names:
             found[name][out] = judged.linear(name.removeprefix("linear, "), out)
         with _population_of(judged.people.select(~out)):
@@ -242,7 +225,6 @@ def meridian_predictions(
                 found[name][out] = judged.ours(out, **options)
                 elapsed_ms = 1e3 * (time.perf_counter() - start_s)
                 times_ms[name] += elapsed_ms / shape[0]
-        task((k + 1) / fold_count)
     mean = np.full(shape, np.nan)
     for out in folds(judged.people, fold_count):
         mean[out] = np.nanmean(judged.change_um[~out], axis=0)
@@ -253,41 +235,10 @@ def meridian_predictions(
     }
 
 
-def ratio_rows(judged: Meridian, fold_count: int, draws: int) -> Iterator[Row]:
-    """Error of ours over that of the regression on M, mean and deviation of draws."""
-    ratios = []
-    for seed in range(SEED, SEED + draws):
-        ours, linear = (np.full(judged.change_um.shape, np.nan) for _ in range(2))
-        for out in folds(judged.people, fold_count, seed):
-            linear[out] = judged.linear("M", out)
-            with _population_of(judged.people.select(~out)):
-                ours[out] = judged.ours(out, given=False)
-        errors = [median_errors(told, judged.change_um)[0] for told in (ours, linear)]
-        ratios.append(errors[0] / errors[1])
-    for name, values in (
-        ("mean ratio", np.mean(ratios, axis=0)),
-        ("deviation of the ratio", np.std(ratios, axis=0)),
-    ):
-        for angle, value in zip(ANGLES_DEG, values, strict=True):
-            yield Row(
-                *("people", "people over linear, M", "left out"),
-                *(f"retina {angle:+.0f} deg", draws, 0.0, 0.0, memory_mb()),
-                *(name, float(value), "Jaeken & Artal 2012"),
-            )
-
-
 def _population_of(people: MeasuredEyes):
     """Return a context in which these people are the population."""
     population = Population.fit(people)
     return patch("estimator.periphery.change.measured_population", lambda: population)
-
-
-def _rows(method, setting, count, time_ms, errors, reference) -> Iterator[Row]:
-    for name, error in zip(("power_error_dpt", "rms_um"), errors, strict=True):
-        yield Row(
-            *("people", method, "left out", setting, count, time_ms, time_ms),
-            *(memory_mb(), name, float(error), reference),
-        )
 
 
 def meridian_rows(judged: Meridian, predictions: dict) -> Iterator[Row]:
@@ -298,70 +249,12 @@ def meridian_rows(judged: Meridian, predictions: dict) -> Iterator[Row]:
         for k, angle in enumerate(ANGLES_DEG):
             if "20 deg" in method and angle in GIVEN_DEG:
                 continue
-            yield from _rows(
-                *(method, f"retina {angle:+.0f} deg", int(known[k]), time_ms),
-                *((errors[0][k], errors[1][k]), "Jaeken & Artal 2012"),
-            )
-
-
-def direction_rows() -> Iterator[Row]:
-    """What 627 directions of each preset take, and how far M is from people's."""
-    h_deg, v_deg = (
-        values.ravel()
-        for values in np.meshgrid(np.linspace(-40, 40, 33), np.linspace(-24, 24, 19))
-    )
-    for name in preset_names():
-        profile = parse_profile({"kind": "preset", "name": name})
-        times_ms = []
-        for _ in range(REPEATS):
-            start_s = time.perf_counter()
-            found_um = told_change_um(profile, h_deg, v_deg)
-            times_ms.append(1e3 * (time.perf_counter() - start_s))
-        told_um = peripheral_change(profile).zernike_um(h_deg, v_deg)
-        error_um = found_um - told_um[:, list(TERMS)]
-        sphere = TERMS.index(4)
-        error_dpt = SPHERE_PER_C20 * np.abs(error_um[:, sphere]) / CIRCLE_MM**2
-        yield Row(
-            *("people", "627 directions", name, "40 x 24 deg", REPEATS),
-            float(np.median(times_ms)),
-            float(np.max(times_ms)),
-            *(memory_mb(), "M, median error, dpt", float(np.median(error_dpt))),
-            "people's change for such an axis",
-        )
-
-
-def field_rows() -> Iterator[Row]:
-    """Errors over the whole field of five people that no population has seen."""
-    directions_deg, zernike_um = load_measured_fields(FILE)
-    h_deg, v_deg = directions_deg.T
-    axis = int(np.flatnonzero((h_deg == 0.0) & (v_deg == 0.0))[0])
-    on_disc = (h_deg >= 10.0) & (h_deg <= 20.0)  # the optic disc spoils these
-    judged = (h_deg % 10.0 == 0.0) & ~on_disc & (np.hypot(h_deg, v_deg) > 5.0)
-    change_um = zernike_um[:, judged] - zernike_um[:, [axis]]
-    others = [
-        np.mean(np.delete(change_um, k, axis=0), axis=0) for k in range(len(change_um))
-    ]
-    methods = {
-        "the axis everywhere": np.zeros_like(change_um),
-        "mean change of the other four": np.array(others),
-    }
-    times_ms = dict.fromkeys(methods, 0.0)
-    for method, more in (("eye model alone", {"periphery": "model"}), ("people", {})):
-        start_s = time.perf_counter()
-        methods[method] = np.array(
-            [
-                told_change_um(profile_of(eye[axis], **more), *directions_deg[judged].T)
-                for eye in zernike_um
-            ]
-        )
-        times_ms[method] = 1e3 * (time.perf_counter() - start_s) / len(zernike_um)
-    for method, predicted_um in methods.items():
-        flat = [values.reshape(-1, len(TERMS)) for values in (predicted_um, change_um)]
-        errors = [float(error) for error in median_errors(*flat)]
-        yield from _rows(
-            *(method, "40 x 25 deg", len(flat[0]), times_ms[method], errors),
-            "Polans 2015",
-        )
+            for name, error in zip(("power_error_dpt", "rms_um"), errors, strict=True):
+                yield timed_row(
+                    *("people", method, "left out", f"retina {angle:+.0f} deg"),
+                    *([time_ms], name, error[k], "Jaeken & Artal 2012"),
+                    n=int(known[k]),
+                )
 
 
 def field_findings(
@@ -404,24 +297,27 @@ def field_findings(
     )
 
 
-def found_beside_people(
-    people: MeasuredEyes,
-    seeds: Sequence[int],
-    quick: bool,
-    curves: Curves,
-    task: Callable[[float, str], None],
-) -> list[Finding]:
-    """Return the results of all comparisons with published measurements."""
-    step = QUICK_STEP if quick else 1
-    readers = QUICK_ACUITY_PEOPLE if quick else ACUITY_PEOPLE
-    fields = QUICK_FIELDS if quick else FIELDS
-    fold_count = QUICK_FOLDS if quick else FOLDS
+def options(parser) -> None:
+    """Add the options of this benchmark."""
+    parser.add_argument("--people", type=int, metavar="N", help="drawn persons")
+
+
+def measure(run: Run) -> list[Row]:
+    """Return the rows of all comparisons, and draw the picture."""
+    quick = run.is_quick
+    judged, step = Meridian(load_measured_eyes(FILE)), QUICK_STEP if quick else 1
+    people, fold_count = judged.people, QUICK_FOLDS if quick else FOLDS
+    count = run.options.people
+    if count is None:
+        count = QUICK_PEOPLE if quick else PEOPLE
+    seeds = range(count)
+    curves: Curves = {}
     sections = {
         "modulation": lambda: modulation_findings(
-            seeds, people.select(_every(step, people)), curves
+            seeds, people.select(np.arange(len(people.person)) % step == 0), curves
         ),
         "same people": lambda: field_findings(
-            people, fold_count, fields if seeds else 0, step, curves
+            people, fold_count, QUICK_FIELDS if quick else FIELDS, step, curves
         ),
         "spread": lambda: spread_findings(
             people,
@@ -434,85 +330,18 @@ def found_beside_people(
         "near periphery": lambda: near_findings(seeds),
         "refraction": lambda: refraction_findings(seeds, people),
         "acuity": lambda: acuity_findings(
-            seeds[:readers], QUICK_PUPILS_MM if quick else PUPILS_MM
+            seeds[: 0 if quick else ACUITY_PEOPLE], (4.0,) if quick else PUPILS_MM
         ),
         "straylight": straylight_findings,
     }
-    found: list[Finding] = []
-    for k, (name, section) in enumerate(sections.items()):
-        task(k / len(sections), name)
-        found += section()
-    return found
-
-
-def _every(step: int, people: MeasuredEyes) -> NDArray[np.bool_]:
-    return np.arange(len(people.person)) % step == 0
-
-
-def print_table(rows: list[Row]) -> None:
-    """Print errors over the retina, a method a line."""
-    print(f"{'retina, deg':34s}" + "".join(f"{a:+7.0f}" for a in ANGLES_DEG))
-    names = dict.fromkeys(row.error_name for row in rows if "retina" in row.setting)
-    units = {"power_error_dpt": "dpt", "rms_um": "um"}
-    for name in names:
-        for method in dict.fromkeys(row.method for row in rows):
-            cells = {
-                row.setting: row.error
-                for row in rows
-                if row.method == method and row.error_name == name
-            }
-            line = [cells.get(f"retina {angle:+.0f} deg") for angle in ANGLES_DEG]
-            if any(cell is not None for cell in line):
-                print(
-                    f"{method + ', ' + units.get(name, name):34.34s}"
-                    + "".join("      -" if c is None else f"{c:7.2f}" for c in line)
-                )
-
-
-def main() -> None:
-    """Run from the command line."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--quick", action="store_true", help="two folds")
-    parser.add_argument("--json", action="store_true", help="print the report alone")
-    parser.add_argument("--plot", action="store_true", help="fields of the presets")
-    parser.add_argument("--people", type=int, metavar="N", help="drawn persons")
-    options = parser.parse_args()
-    judged = Meridian(load_measured_eyes(FILE))
-    measured_population()
-    with Progress(quiet=options.json) as progress:
-        task = progress.task("people", total=1.0, unit="%")
-        count = QUICK_FOLDS if options.quick else FOLDS
-        predictions = meridian_predictions(
-            judged, count, lambda done: task.update(done, "folds")
-        )
-        task.update(1.0, "ratios")
-        draws = QUICK_DRAWS if options.quick else DRAWS
-        ratios = list(ratio_rows(judged, count, draws))
-        persons = options.people
-        if persons is None:
-            persons = QUICK_PEOPLE if options.quick else PEOPLE
-        curves: Curves = {}
-        findings = found_beside_people(
-            judged.people,
-            range(persons),
-            options.quick,
-            curves,
-            lambda done, name: task.update(done, name),
-        )
-    rows = [*meridian_rows(judged, predictions), *ratios]
-    rows += [*field_rows(), *direction_rows()]
-    rows += [row for found in findings for row in found.rows()]
-    if not options.json:
-        print_table(rows)
-        print_findings(findings)
-    whole = not options.quick and options.people is None
-    folder = RESULTS if whole else OUT
-    plot_findings(folder / "people_measures.png", findings, curves)
-    if options.plot:
-        plot_fields(RESULTS / "people.png")
-        show_scene(RESULTS / "people_scene.jpg")
-    publish("people", rows, as_json=options.json, is_whole=whole)
-
-
-if __name__ == "__main__":
-    main()
+    print("people: folds", file=sys.stderr, flush=True)
+    rows = list(meridian_rows(judged, meridian_predictions(judged, fold_count)))
+    findings: list[Finding] = []
+    for name, section in sections.items():
+        print(f"people: {name}", file=sys.stderr, flush=True)
+        findings += section()
+    is_whole = not quick and run.options.people is None
+    plot_findings(
+        (RESULTS if is_whole else OUT) / "people_measures.png", findings, curves
+    )
+    return rows + [row for found in findings for row in found.rows()]

@@ -1,13 +1,14 @@
 """Results of comparisons between modeled eyes and measurements of people."""
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tests.benchmarks.harness import Row, memory_mb
+from tests.benchmarks.harness import Row
+from tests.benchmarks.rows import timed_row
 
 BAND = (10.0, 90.0)
 """Percentiles of people that bands show."""
@@ -75,11 +76,11 @@ class Finding:
         limits = f" ({low:.3f} to {high:.3f})" if math.isfinite(low) else ""
         for suffix, value in values.items():
             if math.isfinite(value):
-                yield Row(
+                yield timed_row(
                     *("people", self.measure, self.eyes),
                     f"{self.setting}{suffix}: {value:.3f}{limits}",
-                    *(self.count, self.time_ms, self.time_ms, memory_mb()),
-                    *(self.unit, value - self.theirs, self.source),
+                    *([self.time_ms], self.unit, value - self.theirs, self.source),
+                    n=self.count,
                 )
 
 
@@ -89,27 +90,3 @@ def band_of(values: NDArray[np.float64]) -> tuple[float, float]:
         return math.nan, math.nan
     low, high = np.nanpercentile(values, BAND).tolist()
     return low, high
-
-
-def print_findings(findings: Iterable[Finding]) -> None:
-    """Print modeled and published values, and the effects of the instrument."""
-    print(
-        f"\n{'measure':<25}{'eyes':<25}{'setting':<32}{'ours':>8}{'theirs':>8}"
-        f"{'diff':>8}{'residu':>8}{'halo':>8}{'left':>8}  {'range':<16}source"
-    )
-    for found in findings:
-        left = (
-            found.with_halo if math.isfinite(found.with_halo) else found.with_residual
-        )
-        cells = (
-            *(found.ours, found.theirs, found.difference),
-            *(found.with_residual - found.ours, found.with_halo - found.with_residual),
-            left - found.theirs,
-        )
-        texts = [f"{c:8.3f}" if math.isfinite(c) else f"{'-':>8}" for c in cells]
-        low, high = found.band if math.isnan(found.interval[0]) else found.interval
-        band = f"{low:.3f} {high:.3f}" if math.isfinite(low) else "-"
-        print(
-            f"{found.measure:<25}{found.eyes:<25}{found.setting:<32}"
-            f"{''.join(texts)}  {band:<16}{found.source}"
-        )

@@ -179,7 +179,7 @@ def test_how_far_eyes_turn_follows_from_the_tracker_unless_it_is_told():
 @pytest.mark.slow
 def test_the_benchmark_runs_and_is_right():
     finished = subprocess.run(
-        [sys.executable, "-m", "tests.benchmarks.bench_headset", "--quick", "--json"],
+        [sys.executable, "-m", "tests.benchmarks", "headset", "--quick", "--json"],
         cwd=CHECKOUT,
         capture_output=True,
         text=True,
