@@ -54,10 +54,22 @@ class Finding:
     band: tuple[float, float] = (math.nan, math.nan)
     interval: tuple[float, float] = (math.nan, math.nan)
 
-    @property
-    def difference(self) -> float:
-        """Return the value of modeled eyes minus the published one."""
-        return self.ours - self.theirs
+    @classmethod
+    def of(
+        cls,
+        measure: str,
+        eyes: str,
+        setting: str,
+        values: NDArray[np.float64],
+        theirs: float,
+        unit: str,
+        source: str,
+        **more,
+    ) -> "Finding":
+        """Return the mean of modeled eyes (n,), with their number and `BAND`."""
+        more = {"count": len(values), "band": band_of(values)} | more
+        ours = float(np.mean(values))
+        return cls(measure, eyes, setting, ours, float(theirs), unit, source, **more)
 
     @property
     def is_inside(self) -> bool:

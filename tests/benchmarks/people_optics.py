@@ -7,7 +7,7 @@ chief ray on which the wavefronts are given.
 
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +19,7 @@ from estimator.optics.zernike import N_TERMS, index_from_nm, rescale_pupil
 from estimator.periphery.population import CIRCLE_MM, TERMS, MeasuredEyes
 from estimator.profiles.parse import EyeProfile, parse_profile
 from tests import human_data
-from tests.benchmarks.people_findings import Finding, band_of
+from tests.benchmarks.people_findings import Finding
 from tests.benchmarks.people_modulation import (
     AT_CPD,
     modulation,
@@ -42,6 +42,7 @@ MATHUR_ANGLE_DEG = 20.0
 SPHERICAL_FOCI_DPT = (0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0)
 SPHERICAL_PUPILS_MM = (5.0, 6.0)
 LARGEST_PUPIL_MM = 6.0
+MERIDIAN, MEAN_OF_CPD = "Jaeken & Artal 2012", "mean of 1 to 30 cpd"
 
 
 def emmetrope(sphere_dpt: float = 0.0, **more) -> EyeProfile:
@@ -49,11 +50,13 @@ def emmetrope(sphere_dpt: float = 0.0, **more) -> EyeProfile:
     return parse_profile({"kind": "prescription", "sphere_dpt": sphere_dpt, **more})
 
 
-def emmetropes(seeds: Sequence[int]) -> dict[str, list[EyeProfile]]:
-    """Return the typical eye, and drawn persons, if any."""
-    eyes = {"typical eye": [emmetrope()]}
+def emmetropes(
+    seeds: Sequence[int], sphere_dpt: float = 0.0
+) -> dict[str, list[EyeProfile]]:
+    """Return the typical eye of a prescription, and drawn persons, if any."""
+    eyes = {"typical eye": [emmetrope(sphere_dpt)]}
     if seeds:
-        eyes["drawn persons"] = [emmetrope(sample=seed) for seed in seeds]
+        eyes["drawn persons"] = [emmetrope(sphere_dpt, sample=seed) for seed in seeds]
     return eyes
 
 
@@ -138,13 +141,12 @@ def modulation_findings(
             curves[eyes, angle] = of_eyes
             seen = known_mean(blurred[:, both])
             theirs = human_data.navarro_modulation(AT_CPD, int(angle)).mean()
-            yield Finding(
+            yield Finding.of(
                 *("modulation", eyes, f"{angle:g} deg, {pupil_mm:g} mm"),
-                *(float(of_eyes.mean()), float(theirs), "mean of 1 to 30 cpd"),
-                *("Navarro 1993", len(of_eyes), elapsed_ms),
+                *(of_eyes.mean(axis=1), theirs, MEAN_OF_CPD, "Navarro 1993"),
+                time_ms=elapsed_ms,
                 with_residual=float(np.nanmean(seen)),
                 with_halo=float(np.nanmean(with_halo(seen))),
-                band=band_of(of_eyes.mean(axis=1)),
             )
     yield from _foveal_findings(seeds, people)
 
@@ -191,13 +193,11 @@ def _foveal_findings(seeds: Sequence[int], people: MeasuredEyes) -> Iterator[Fin
             scaled_um = rescale_pupil(axis_um, radius_ratio=pupil_mm / of_mm)
             corrected_um = refracted(scaled_um[:, None], scaled_um, "at each angle")
             plain, blurred = _and_residual(corrected_um, pupil_mm, wavelength_nm)
-            yield Finding(
+            yield Finding.of(
                 *("modulation", eyes, f"fovea, {pupil_mm:g} mm"),
-                *(float(plain.mean()), float(theirs.mean()), "mean of 1 to 30 cpd"),
-                *(source, len(axis_um)),
+                *(plain.mean(axis=(1, 2)), theirs.mean(), MEAN_OF_CPD, source),
                 with_residual=float(blurred.mean()),
                 with_halo=float(with_halo(blurred).mean()) if halo else math.nan,
-                band=band_of(plain.mean(axis=(1, 2))),
             )
 
 
@@ -247,12 +247,12 @@ def own_field_findings(
                 if is_foveal:
                     curves[method, angle] = ours
                     curves["their own fields", angle] = theirs
-                yield Finding(
+                yield Finding.of(
                     *("modulation, same people", method),
                     f"{angle:g} deg, refracted {refraction}",
-                    *(float(ours.mean()), float(theirs.mean()), "mean of 1 to 30 cpd"),
-                    *("Jaeken & Artal 2012", int(known.sum()), times_ms[method]),
-                    band=band_of(ours.mean(axis=1)),
+                    *(ours.mean(axis=1), theirs.mean(), MEAN_OF_CPD, MERIDIAN),
+                    count=int(known.sum()),
+                    time_ms=times_ms[method],
                 )
 
 
@@ -263,38 +263,30 @@ def higher_order_findings(
     seeds: Sequence[int], people: MeasuredEyes
 ) -> Iterator[Finding]:
     """RMS of orders 3 to 6 on the axis; orders 3 and 4 of measured people."""
-    kinds: dict[str, Callable[[float], tuple[NDArray, float]]] = {}
-    for eyes, profiles in emmetropes(seeds).items():
+    kinds: dict[str, Sequence[EyeProfile] | None] = {
+        **emmetropes(seeds),
+        "people's own wavefronts": None,
+    }
 
-        def rms_um(pupil_mm: float, profiles=profiles) -> tuple[NDArray, float]:
-            start_s = time.perf_counter()
-            waves_um = [
-                on_circle_um(profile, 0.0, pupil_diameter_mm=pupil_mm)[0]
-                for profile in profiles
-            ]
-            elapsed_ms = 1e3 * (time.perf_counter() - start_s) / len(profiles)
-            higher_um = np.array(waves_um)[:, HIGHER_ORDERS]
-            return np.linalg.norm(higher_um, axis=1), elapsed_ms
+    def waves_um(profiles, pupil_mm: float) -> NDArray[np.float64]:
+        if profiles is None:
+            ratio = pupil_mm / (2.0 * CIRCLE_MM)
+            return rescale_pupil(all_terms(people.axis_um), radius_ratio=ratio)
+        at = {"pupil_diameter_mm": pupil_mm}
+        return np.array([on_circle_um(p, 0.0, **at)[0] for p in profiles])
 
-        kinds[eyes] = rms_um
-
-    def measured_um(pupil_mm: float) -> tuple[NDArray, float]:
-        ratio = pupil_mm / (2.0 * CIRCLE_MM)
-        waves_um = rescale_pupil(all_terms(people.axis_um), radius_ratio=ratio)
-        return np.linalg.norm(waves_um[:, HIGHER_ORDERS], axis=1), 0.0
-
-    kinds["people's own wavefronts"] = measured_um
-    for eyes, rms in kinds.items():
+    for eyes, profiles in kinds.items():
         for pupil_mm, theirs_um in human_data.SALMON_RMS_UM.items():
-            if eyes.startswith("people") and pupil_mm > 2.0 * CIRCLE_MM:
+            if profiles is None and pupil_mm > 2.0 * CIRCLE_MM:
                 continue
-            found_um, elapsed_ms = rms(pupil_mm)
-            same = (len(found_um), elapsed_ms)
-            yield Finding(
+            start_s = time.perf_counter()
+            higher_um = waves_um(profiles, pupil_mm)[:, HIGHER_ORDERS]
+            found_um = np.linalg.norm(higher_um, axis=1)
+            elapsed_ms = 1e3 * (time.perf_counter() - start_s) / len(found_um)
+            yield Finding.of(
                 *("higher-order RMS", eyes, f"mean, {pupil_mm:g} mm"),
-                *(float(found_um.mean()), theirs_um, "um", "Salmon & van de Pol 2006"),
-                *same,
-                band=band_of(found_um),
+                *(found_um, theirs_um, "um", "Salmon & van de Pol 2006"),
+                time_ms=elapsed_ms,
             )
             if len(found_um) > 1:
                 below = float(np.mean(found_um < 2.0 * theirs_um))
@@ -302,7 +294,7 @@ def higher_order_findings(
                     *("higher-order RMS", eyes),
                     f"below twice theirs, {pupil_mm:g} mm",
                     *(below, human_data.SALMON_TWICE_RATIO, "ratio, at least"),
-                    *("Salmon & van de Pol 2006", *same),
+                    *("Salmon & van de Pol 2006", len(found_um), elapsed_ms),
                 )
 
 
@@ -312,60 +304,35 @@ def higher_order_findings(
 def near_findings(seeds: Sequence[int]) -> Iterator[Finding]:
     """Change of the periphery, relative to the axis, by accommodation."""
     sides_deg = np.array([-NEAR_ANGLE_DEG, NEAR_ANGLE_DEG], dtype=np.float64)
+    far, *near = NEAR_FOCI_DPT
     for eyes, profiles in emmetropes(seeds).items():
         for pupil_mm in NEAR_PUPILS_MM:
-            relative = {
+            relative_dpt = {
                 focus: np.array(
-                    [_relative(p, sides_deg, pupil_mm, focus) for p in profiles]
-                )
+                    [_relative_dpt(p, sides_deg, pupil_mm, focus) for p in profiles]
+                ).mean(axis=1)
                 for focus in NEAR_FOCI_DPT
             }
-            far = relative[NEAR_FOCI_DPT[0]]
-            for focus in NEAR_FOCI_DPT[1:]:
-                changes = relative[focus] - far
-                yield from _near_rows(eyes, pupil_mm, focus, changes)
+            for focus in near:
+                change_dpt = relative_dpt[focus] - relative_dpt[far]
+                for source, ratio in human_data.NEAR_PERIPHERY_RATIO.items():
+                    yield Finding.of(
+                        *("near periphery, M", eyes, f"{focus:g} dpt, {pupil_mm:g} mm"),
+                        *(change_dpt, ratio * focus, "dpt", source),
+                    )
         yield from _mathur(eyes, profiles)
         yield from _spherical_rows(eyes, profiles)
 
 
-def _relative(
+def _relative_dpt(
     profile: EyeProfile, h_deg: NDArray, pupil_mm: float, focus_dpt: float
 ) -> NDArray[np.float64]:
-    """Return M, J0, J45 and C(3,1) (n, 4) less those of the axis."""
+    """Return M (n,) less that of the axis."""
     zernike_um = on_circle_um(
         profile, [0.0, *h_deg], pupil_diameter_mm=pupil_mm, focus_dpt=focus_dpt
     )
-    power_dpt = power_vectors_dpt(zernike_um, pupil_mm / 2.0)
-    values = np.c_[power_dpt, zernike_um[:, index_from_nm(3, 1)]]
-    return values[1:] - values[0]
-
-
-def _near_rows(
-    eyes: str, pupil_mm: float, focus_dpt: float, changes: NDArray
-) -> Iterator[Finding]:
-    """Yield changes (n, 2, 4) of both sides: of M beside studies, and others."""
-    setting = f"{focus_dpt:g} dpt, {pupil_mm:g} mm"
-    of_sides = changes.mean(axis=1)
-    for source, ratio in human_data.NEAR_PERIPHERY_RATIO.items():
-        yield Finding(
-            *("near periphery, M", eyes, setting),
-            *(float(of_sides[:, 0].mean()), ratio * focus_dpt, "dpt", source),
-            count=len(changes),
-            band=band_of(of_sides[:, 0]),
-        )
-    # Coma is odd over the field: its change is that of its slope.
-    odd = 0.5 * (changes[:, 1] - changes[:, 0])
-    for name, values, unit in (
-        ("J0", of_sides[:, 1], "dpt"),
-        ("J45", of_sides[:, 2], "dpt"),
-        ("coma x", odd[:, 3], "um"),
-    ):
-        yield Finding(
-            *(f"near periphery, {name}", eyes, setting),
-            *(float(values.mean()), 0.0, unit, "Mathur 2009"),
-            count=len(changes),
-            band=band_of(values),
-        )
+    power_dpt = power_vectors_dpt(zernike_um, pupil_mm / 2.0)[:, 0]
+    return power_dpt[1:] - power_dpt[0]
 
 
 def _mathur(eyes: str, profiles: Sequence[EyeProfile]) -> Iterator[Finding]:
@@ -385,12 +352,10 @@ def _mathur(eyes: str, profiles: Sequence[EyeProfile]) -> Iterator[Finding]:
         (0.0, change_um[:, 0]),
         (MATHUR_ANGLE_DEG, change_um[:, 1:].mean(axis=1)),
     ):
-        yield Finding(
+        yield Finding.of(
             *("near periphery, C40", eyes),
             f"{far_dpt:g} to {near_dpt:g} dpt, {angle:g} deg, {pupil_mm:g} mm",
-            *(float(values_um.mean()), human_data.MATHUR_C40_UM, "um", "Mathur 2009"),
-            count=len(profiles),
-            band=band_of(values_um),
+            *(values_um, human_data.MATHUR_C40_UM, "um", "Mathur 2009"),
         )
 
 
@@ -410,23 +375,19 @@ def _spherical_rows(eyes: str, profiles: Sequence[EyeProfile]) -> Iterator[Findi
         change_um = at_um - at_um[:, :1]
         slope_um = float(human_data.mathur_slope_um(pupil_mm))
         for k, focus in enumerate(SPHERICAL_FOCI_DPT[1:], start=1):
-            yield Finding(
+            yield Finding.of(
                 *("accommodation, C40", eyes),
                 f"{far:g} to {focus:g} dpt, {pupil_mm:g} mm",
-                *(float(change_um[:, k].mean()), slope_um * (focus - far), "um"),
+                *(change_um[:, k], slope_um * (focus - far), "um"),
                 "Mathur 2009, scaled by r^4",
-                count=len(profiles),
-                band=band_of(change_um[:, k]),
             )
         taken = human_data.taken_ratio(
             change_um[:, -1] / (SPHERICAL_FOCI_DPT[-1] - far), pupil_mm
         )
-        yield Finding(
+        yield Finding.of(
             *("accommodation, response taken", eyes, f"0 to 6 dpt, {pupil_mm:g} mm"),
-            *(float(taken.mean()), human_data.LOPEZ_GIL_RATIO, "ratio"),
+            *(taken, human_data.LOPEZ_GIL_RATIO, "ratio"),
             "López-Gil & Fernández-Sánchez 2010, natural pupils",
-            count=len(profiles),
-            band=band_of(taken),
         )
 
 
@@ -444,27 +405,20 @@ def refraction_findings(
         known = np.isfinite(relative_dpt[:, k])
         line = np.polyfit(axis_dpt[known], relative_dpt[known, k], 1)
         for sphere_dpt in SPHERES_DPT:
-            bodies = {"typical eye": [{}]}
-            if seeds:
-                bodies["drawn persons"] = [{"sample": seed} for seed in seeds]
-            for eyes, fields in bodies.items():
+            for eyes, profiles in emmetropes(seeds, sphere_dpt).items():
                 found_dpt = np.array(
                     [
-                        _relative(
-                            emmetrope(sphere_dpt, **more),
+                        _relative_dpt(
+                            profile,
                             np.array([side * NEAR_ANGLE_DEG]),
                             2.0 * CIRCLE_MM,
                             -60.0,
-                        )[0, 0]
-                        for more in fields
+                        )[0]
+                        for profile in profiles
                     ]
                 )
-                yield Finding(
+                yield Finding.of(
                     *("relative periphery, M", eyes),
                     f"{sphere_dpt:g} dpt, {side * NEAR_ANGLE_DEG:+.0f} deg, 4 mm",
-                    float(found_dpt.mean()),
-                    float(np.polyval(line, sphere_dpt)),
-                    *("dpt", "Jaeken & Artal 2012"),
-                    count=len(found_dpt),
-                    band=band_of(found_dpt),
+                    *(found_dpt, np.polyval(line, sphere_dpt), "dpt", MERIDIAN),
                 )

@@ -11,7 +11,7 @@ from estimator.optics.prescription import zernike_from_power_vector
 from estimator.optics.zernike import rescale_pupil
 from estimator.profiles.parse import parse_profile
 from tests import human_data
-from tests.benchmarks.people_findings import Finding, band_of
+from tests.benchmarks.people_findings import Finding
 from tests.benchmarks.people_optics import (
     LARGEST_PUPIL_MM,
     emmetropes,
@@ -70,24 +70,22 @@ def acuity_findings(
                 lost = human_data.blendowske_lost_log_mar(DEFOCUS_DPT)
                 ours_lost = blurred - in_focus[:, None]
                 laws["Blendowske 2015"] = lost, "logMAR lost", ours_lost
-            yield Finding(
+            yield Finding.of(
                 *("acuity in focus", eyes, f"best corrected, {pupil_mm:g} mm"),
-                *(float(in_focus.mean()), human_data.YOUNG_LOG_MAR, "logMAR"),
-                *("Elliott 1995", len(found), elapsed_ms),
-                band=band_of(in_focus),
+                *(in_focus, human_data.YOUNG_LOG_MAR, "logMAR", "Elliott 1995"),
+                time_ms=elapsed_ms,
             )
             setting = f"{DEFOCUS_DPT[0]:g} to {DEFOCUS_DPT[-1]:g} dpt, {pupil_mm:g} mm"
             for source, (theirs, unit, ours) in laws.items():
-                same = (source, len(found), elapsed_ms)
-                yield Finding(
+                yield Finding.of(
                     *("acuity out of focus", eyes, f"mean, {setting}"),
-                    *(float(ours.mean()), float(theirs.mean()), unit, *same),
-                    band=band_of(ours.mean(axis=1)),
+                    *(ours.mean(axis=1), theirs.mean(), unit, source),
+                    time_ms=elapsed_ms,
                 )
                 r = np.corrcoef(ours.mean(axis=0), theirs)[0, 1]
                 yield Finding(
                     *("acuity out of focus", eyes, f"R², {setting}"),
-                    *(float(r**2), 1.0, "R²", *same),
+                    *(float(r**2), 1.0, "R²", source, len(found), elapsed_ms),
                 )
 
 

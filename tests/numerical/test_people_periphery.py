@@ -28,7 +28,9 @@ from estimator.periphery.population import (
     meridian_weights,
 )
 from estimator.profiles.parse import ProfileError, parse_profile
-from tests.benchmarks.bench_people import (
+from tests.benchmarks.people_optics import on_circle_um
+from tests.measured_fields import load_measured_fields
+from tests.numerical.left_out_people import (
     ANGLES_DEG,
     FILE,
     Meridian,
@@ -36,8 +38,6 @@ from tests.benchmarks.bench_people import (
     median_errors,
     profile_of,
 )
-from tests.benchmarks.people_optics import on_circle_um
-from tests.measured_fields import load_measured_fields
 
 GRID_DEG = np.stack(
     np.meshgrid(np.linspace(-38.0, 38.0, 9), np.linspace(-24.0, 24.0, 7)), axis=-1

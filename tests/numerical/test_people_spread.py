@@ -12,7 +12,6 @@ from estimator.periphery.population import (
 )
 from estimator.profiles import typical_aberrations
 from estimator.profiles.typical_aberrations import LARGEST_RMS_UM, drawn_zernike_um
-from tests.benchmarks.bench_people import FILE, Meridian, folds, profile_of
 from tests.benchmarks.people_findings import Finding
 from tests.benchmarks.people_spread import (
     AT_DEG,
@@ -29,6 +28,7 @@ from tests.benchmarks.people_spread import (
     spreads,
     traced_dpt,
 )
+from tests.numerical.left_out_people import FILE, Meridian, folds, profile_of
 
 PERSONS = 150
 """Drawn persons of the fast tests."""
