@@ -33,7 +33,7 @@ from filter_service.keys import KeyRing
 from filter_service.service.router import SEED_VARIABLE
 from tests.attacks import ATTACKS, FLOODS
 from tests.benchmarks.harness import ROOT, Row, Run
-from tests.benchmarks.rows import timed_row
+from tests.benchmarks.rows import row_of
 from tests.benchmarks.service_stream import PROFILE, Stream, processor_s
 from tests.mutated_messages import view_of
 
@@ -53,7 +53,7 @@ QUICK = ("pings", "mutated_messages")
 
 
 DOUBLE = {"kind": "double", "mark": 7}
-row = partial(timed_row, "abuse")
+row = partial(row_of, "abuse")
 
 
 def guest(endpoint: str, key_file: Path | None = None, body: dict = DOUBLE) -> Stream:
@@ -76,14 +76,24 @@ def rows_of(
     rates_hz: tuple[float, float],
     errors: Mapping[str, float],
     reference: str,
-    mb: float,
+    used_mb: float,
 ) -> list[Row]:
     """Return a row for each error; times are a frame's without and with the attack."""
     setting = ", ".join(f"{value} {key}" for key, value in counts.items())
     base_hz, hz = rates_hz
     times_ms = [1e3 / max(base_hz, 1e-3), 1e3 / max(hz, 1e-3)]
     return [
-        row(method, case, setting[:60], times_ms, what, error, reference, n=1, mb=mb)
+        row(
+            method,
+            case,
+            setting[:60],
+            times_ms,
+            what,
+            error,
+            reference,
+            n=1,
+            used_mb=used_mb,
+        )
         for what, error in errors.items()
     ]
 
@@ -207,7 +217,7 @@ def assertion_rows() -> list[Row]:
         row(
             *("forced assertion", f"{rate_hz:.0f}/s after", "", [1e3 * gap_s]),
             *(what, error, "a known seed"),
-            mb=0.0,
+            used_mb=0.0,
         )
         for what, error in errors.items()
     ]

@@ -38,7 +38,7 @@ from estimator.profiles.typical_aberrations import (
 )
 from tests import human_data
 from tests.benchmarks.harness import Row, Run
-from tests.benchmarks.rows import timed_row
+from tests.benchmarks.rows import row_of
 
 MINUTES = 1
 PEOPLE = Path(__file__).parents[1] / "data" / "peripheral_wavefronts.npz"
@@ -54,7 +54,7 @@ DEFOCUS_DPT = (0.5, 1.0, 2.0, 3.0, 4.0)
 FOVEAL_CPD = 65.37
 
 
-row = partial(timed_row, "acuity")
+row = partial(row_of, "acuity")
 
 
 def measured_eyes(residual_dpt: float) -> list[NDArray[np.float64]]:

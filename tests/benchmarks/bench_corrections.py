@@ -29,7 +29,7 @@ from estimator.wavefront.field_wavefronts import zernike_from_polynomial
 from filter_service.planning.plan import unchecked_plan
 from filter_service.psfs.eye_for_spec import eye_for_spec
 from tests.benchmarks.harness import Row, Run, time_calls
-from tests.benchmarks.rows import timed_row
+from tests.benchmarks.rows import row_of
 from tests.lens_truth import (
     MM_PER_DEG,
     PUBLISHED,
@@ -74,7 +74,7 @@ STATES, IMAGES_PX = 100, ((480, 270), (1280, 720))
 MINUTES = 0
 
 
-row = partial(timed_row, "corrections")
+row = partial(row_of, "corrections")
 
 
 def _timed(function):

@@ -21,7 +21,7 @@ from estimator import Eye, perfect_transfer
 from estimator.acuity.transfer import neural_sensitivity
 from estimator.optics.zernike import nm_from_index
 from tests.benchmarks.harness import Row, Run
-from tests.benchmarks.rows import timed_row
+from tests.benchmarks.rows import row_of
 from tests.isetbio_psfs import moved_light, published_psfs
 from tests.reference import pupil_sums
 
@@ -36,7 +36,7 @@ CPD = np.array([2.0, 5.0, 10.0, 20.0, 40.0])
 REPEATS = 5
 SUMS = "sum over the pupil"
 MINUTES = 1
-row = partial(timed_row, "eye")
+row = partial(row_of, "eye")
 
 
 def timed(function):

@@ -40,7 +40,7 @@ import numpy as np
 
 from clients.service_process import SERVE_COMMAND, ServiceProcess
 from tests.benchmarks.harness import Row, Run
-from tests.benchmarks.rows import timed_row
+from tests.benchmarks.rows import row_of
 from tests.benchmarks.service_stream import PROFILE, Stream, processor_s, view_of
 
 MINUTES = 30
@@ -63,7 +63,7 @@ ALONE = "the service with one client alone"
 SOAK_SIZE_PX, SOAK_HZ, PROFILE_S, SAMPLE_S = (640, 360), 10.0, 20.0, 5.0
 SPHERES_DPT = np.linspace(-6.0, 2.0, 33)
 
-row = partial(timed_row, "faults")
+row = partial(row_of, "faults")
 
 
 def options(parser) -> None:
@@ -93,7 +93,7 @@ def overload_rows(quick: bool) -> list[Row]:
     return [
         row(
             *("overload", case, "-2 dpt, 4 mm", ages_ms, name, error, ALONE),
-            mb=max(memory_mb),
+            used_mb=max(memory_mb),
         )
         for name, error in (
             ("median_age_periods", float(np.median(ages_ms)) / period_ms),
@@ -223,7 +223,7 @@ def devices_rows(quick: bool) -> list[Row]:
                     row(
                         *(what, case, "1280x720, -2 dpt, 4 mm", values),
                         *(error_name, error, of),
-                        mb=service.memory_mb,
+                        used_mb=service.memory_mb,
                     )
                 )
     return rows
@@ -259,7 +259,7 @@ def killed_rows(quick: bool) -> list[Row]:
         row(
             *("one of two killed", case, "1280x720, -2 dpt, 4 mm", times_ms),
             *("frames_not_filtered", n_lost, ALONE),
-            mb=memory_mb,
+            used_mb=memory_mb,
         )
         for case, (times_ms, n_lost) in found.items()
     ]
@@ -302,7 +302,7 @@ def restart_rows(quick: bool) -> list[Row]:
                 row(
                     *(method, case, f"1280x720 at {RATE_HZ:g} Hz, -2 dpt", times_ms),
                     *("rmse_levels", max(errors), "the same frame before"),
-                    mb=memory_mb,
+                    used_mb=memory_mb,
                 )
                 for method, times_ms in (
                     ("first frame", first_ms),
@@ -373,7 +373,7 @@ def upgrade_rows(quick: bool, old: str | None) -> tuple[list[Row], list[dict]]:
                     *([one["pause_ms"] for one in found], "without event"),
                     sum(one["without_event"] for one in found),
                     "one event for every submitted frame",
-                    mb=max(one["memory_mb"] for one in found),
+                    used_mb=max(one["memory_mb"] for one in found),
                 )
             )
     return rows, runs

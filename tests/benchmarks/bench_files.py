@@ -28,7 +28,7 @@ from threading import Timer
 import numpy as np
 
 from tests.benchmarks.harness import ROOT, Row, Run
-from tests.benchmarks.rows import timed_row
+from tests.benchmarks.rows import row_of
 from tests.file_mutants import Kind, kinds, mutant
 
 N_READS, N_COMMANDS = 100_000, 500
@@ -250,9 +250,9 @@ def rows_of(
 ) -> list[Row]:
     """Return a row for each error."""
     return [
-        timed_row(
+        row_of(
             *("files", method, case, setting, times_ms, name, error, REFERENCE),
-            mb=memory_mb,
+            used_mb=memory_mb,
         )
         for name, error in errors.items()
     ]

@@ -41,7 +41,7 @@ from clients.service_process import ServiceProcess
 from filter_service import FilterSettings
 from filter_service.errors import FilterError
 from tests.benchmarks.harness import KeptRows, Row, Run
-from tests.benchmarks.rows import timed_row
+from tests.benchmarks.rows import row_of
 
 MINUTES = 6
 SIZES_PX = ((448, 504), (896, 1007))
@@ -141,7 +141,7 @@ def watched_run(open_runtime, scenery, seeing, n_frames: int):
 def rows_of(log, took_s: float, method: str, case: str, error: float):
     dropped = f"{log.n_filtered / took_s:.1f} Hz, {log.n_repeated} shown again"
     for name, values in log.stages_ms.items():
-        yield timed_row(
+        yield row_of(
             *("headset", f"{method}: {name.removesuffix('_ms')}", case, dropped),
             *(values, "psnr_db", error, "no tolerance"),
         )

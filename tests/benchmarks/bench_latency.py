@@ -34,7 +34,7 @@ from clients.latency.measure import measure as measure_case
 from clients.service_process import ServiceProcess
 from filter_service.keys import KeyRing
 from tests.benchmarks.harness import Row, Run
-from tests.benchmarks.rows import timed_row
+from tests.benchmarks.rows import row_of
 
 MINUTES = 8
 TRANSPORTS = ("tcp", "ipc", "shm", "curve")
@@ -134,10 +134,10 @@ def rows_of(transport: str, kind: str, found: Measured) -> tuple[list[Row], dict
     case = f"{transport}, {kind}"
     error_db = (found.error or {}).get("psnr_db", float("nan"))
     rows = [
-        timed_row(
+        row_of(
             *("latency", name, case, setting, times_ms),
             *("psnr_db", error_db, REFERENCE),
-            mb=run.memory_end_mb,
+            used_mb=run.memory_end_mb,
         )
         for name, times_ms in stages.items()
     ]

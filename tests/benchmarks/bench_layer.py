@@ -32,7 +32,7 @@ from clients.headset.stereo_gaze import StereoGaze
 from tests.benchmarks import harness
 from tests.benchmarks.bench_headset import PROFILES, SETTINGS, error_db
 from tests.benchmarks.harness import Row, memory_mb
-from tests.benchmarks.rows import timed_row
+from tests.benchmarks.rows import row_of
 from tests.end_to_end.layer_double import RunningHelper
 from tests.openxr_layer import build
 from tests.openxr_layer.layered import layer_environment
@@ -108,7 +108,7 @@ class Bench:
 
     def row(self, method, setting, times_ms, error=float("inf")) -> Row:
         """Return a row of times."""
-        return timed_row(
+        return row_of(
             *("layer", method, self.case, setting, times_ms),
             *("PSNR dB", error, REFERENCE),
         )

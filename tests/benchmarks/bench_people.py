@@ -49,7 +49,7 @@ from tests.benchmarks.people_vision import (
     acuity_findings,
     straylight_findings,
 )
-from tests.benchmarks.rows import timed_row
+from tests.benchmarks.rows import row_of
 from tests.numerical.left_out_people import (
     ANGLES_DEG,
     FILE,
@@ -120,7 +120,7 @@ def meridian_rows(judged: Meridian, predictions: dict) -> Iterator[Row]:
             if "20 deg" in method and angle in GIVEN_DEG:
                 continue
             for name, error in zip(("power_error_dpt", "rms_um"), errors, strict=True):
-                yield timed_row(
+                yield row_of(
                     *("people", method, "left out", f"retina {angle:+.0f} deg"),
                     *([time_ms], name, error[k], "Jaeken & Artal 2012"),
                     n=int(known[k]),

@@ -14,7 +14,7 @@ import numpy as np
 
 from clients.scenarios import filtered_states, scenario_view, scenarios
 from tests.benchmarks.harness import Row, Run
-from tests.benchmarks.rows import timed_row
+from tests.benchmarks.rows import row_of
 from tests.scenario_truth import figures
 
 MINUTES = 2
@@ -34,7 +34,7 @@ def figure_rows() -> list[Row]:
             f"allowed {figure.tolerance:g}"
         )
         rows.append(
-            timed_row(
+            row_of(
                 *("scenarios", "figure", figure.scenario, setting, [elapsed_ms]),
                 *(figure.unit, found - expected, figure.reference),
             )
@@ -53,7 +53,7 @@ def picture_rows(names: list[str]) -> list[Row]:
         elapsed_ms = 1e3 * (time.perf_counter() - start_s)
         moved = float(np.abs(a.color - b.color).mean())
         rows.append(
-            timed_row(
+            row_of(
                 *("scenarios", "picture", name, f"{SIZE_PX[0]}x{SIZE_PX[1]}"),
                 *([elapsed_ms / 2.0], "mean difference of the states"),
                 *(moved, "each other"),

@@ -23,7 +23,7 @@ import numpy as np
 
 from ocufilter import Eye, EyeFilter, stimuli
 from tests.benchmarks.harness import Row, Run
-from tests.benchmarks.rows import timed_row
+from tests.benchmarks.rows import row_of
 from tests.commands import run_command
 from tests.numerical.test_stimuli import (
     AREAS,
@@ -49,7 +49,7 @@ SET = (
 
 def _row(method, case, times_s, name, error, reference) -> Row:
     times_ms, size = 1e3 * np.array(times_s), f"{SIDE_PX}x{SIDE_PX}"
-    return timed_row("stimuli", method, case, size, times_ms, name, error, reference)
+    return row_of("stimuli", method, case, size, times_ms, name, error, reference)
 
 
 def _sizes(draw, measure, heights_arcmin) -> tuple[list[float], float]:

@@ -27,7 +27,7 @@ from estimator.field.traced_fields import peripheral_residual
 from estimator.optics.prescription import Prescription
 from estimator.profiles.parse import parse_profile
 from tests.benchmarks.harness import Row, Run
-from tests.benchmarks.rows import timed_row
+from tests.benchmarks.rows import row_of
 from tests.numerical.iol_formulas import FORMULAS
 
 MINUTES = 1
@@ -57,7 +57,7 @@ CORRECTIONS = {
     "laser": {"kind": "laser"},
 }
 SURGERIES = [name for name in CORRECTIONS if name.startswith(("implant", "laser"))]
-row = partial(timed_row, "surgery")
+row = partial(row_of, "surgery")
 SPHERES_DPT = (-6.0, -3.0, 2.0, 4.0)
 NODES_DEG = np.linspace(-30.0, 30.0, 5), np.zeros(1)
 AT_DEG = np.array([-25.0, 25.0]), np.zeros(2)

@@ -36,7 +36,7 @@ from estimator.profiles.synteyes import (
 from estimator.wavefront.aberrations import on_axis_zernike
 from tests import human_data
 from tests.benchmarks.harness import Row, Run
-from tests.benchmarks.rows import timed_row
+from tests.benchmarks.rows import row_of
 
 FROZEN = Path(__file__).parents[1] / "data" / "visisipy_synteyes.json"
 NAMES = (
@@ -45,7 +45,7 @@ NAMES = (
     "keratometry_dpt",
 )
 N_DRAWN, QUICK_DRAWN = 1000, 50
-row = partial(timed_row, "synteyes")
+row = partial(row_of, "synteyes")
 MINUTES = 1
 WAVELENGTH_NM = 555.0
 RETINA_MM = 0.2

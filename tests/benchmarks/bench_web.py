@@ -32,7 +32,7 @@ from clients.web.picture import linear_from_srgb8, scene_picture
 from filter_service import EyeFilter
 from filter_service.messages import State
 from tests.benchmarks.harness import ROOT, Row, Run
-from tests.benchmarks.rows import timed_row
+from tests.benchmarks.rows import row_of
 from tests.web.browser import PageUnderTest, open_browser
 
 MINUTES = 3
@@ -207,13 +207,13 @@ def measure(run: Run) -> list[Row]:
     found, memory_mb = times(count, n_drags)
     worst_db = errors(STATES[:states], tolerance)
     return [
-        timed_row(
+        row_of(
             *("web", method, slider),
             "courtyard 960x540" if method == "full" else "courtyard 480x270",
             *(values, "psnr_db, worst"),
             worst_db["full" if method == "full" else "preview"],
             f"tolerance {tolerance}, exact rendering",
-            mb=memory_mb,
+            used_mb=memory_mb,
         )
         for (slider, method), values in found.items()
     ]

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tests.benchmarks.harness import Row
-from tests.benchmarks.rows import timed_row
+from tests.benchmarks.rows import row_of
 
 BAND = (10.0, 90.0)
 """Percentiles of people that bands show."""
@@ -88,7 +88,7 @@ class Finding:
         limits = f" ({low:.3f} to {high:.3f})" if math.isfinite(low) else ""
         for suffix, value in values.items():
             if math.isfinite(value):
-                yield timed_row(
+                yield row_of(
                     *("people", self.measure, self.eyes),
                     f"{self.setting}{suffix}: {value:.3f}{limits}",
                     *([self.time_ms], self.unit, value - self.theirs, self.source),
