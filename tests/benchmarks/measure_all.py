@@ -38,7 +38,11 @@ from tests.benchmarks.harness import KEPT_RESULTS, OUT, RESULTS, ROOT, git
 
 FOLDER = Path(__file__).parent
 LOGS = OUT / "results"
-NOT_MEASURED = (":(exclude)tests/benchmarks/results", ":(exclude,glob)**/*.md")
+NOT_MEASURED = (
+    ":(exclude)tests/benchmarks/results",
+    ":(exclude)tests/benchmarks/tables.toml",
+    ":(exclude,glob)**/*.md",
+)
 """What no benchmark depends on: results, and documents with the tables of results."""
 
 GUESS_MINUTES = 3.0
@@ -95,13 +99,10 @@ IN_CHROOT = ("layer",)
 """Benchmarks that run in the chroot, where the checkout is read-only: their result is
 the JSON object that they print."""
 
-OTHERS = {"paper_figures": ("paper_page.pictures", "--out", "{out}")}
-"""Programs that write a result and are no benchmarks: module and arguments."""
-
 
 @dataclass(frozen=True)
 class Benchmark:
-    """A program that writes one result."""
+    """A benchmark, how to run it, and how long that takes."""
 
     name: str
     command: tuple[str, ...]
@@ -135,30 +136,21 @@ def _result(folder: Path, name: str) -> dict:
 
 
 def benchmarks() -> dict[str, Benchmark]:
-    """Return all programs whose results ``make results`` writes, by name."""
-    sources = {p.stem.removeprefix("bench_"): p for p in FOLDER.glob("bench_*.py")}
-    for name, (module, *_) in OTHERS.items():
-        path = FOLDER / f"{module.replace('.', '/')}.py"
-        if path.is_file():
-            sources[name] = path
+    """Return all benchmarks but those of `KEPT_RESULTS`, by name."""
     found = {}
-    for name, path in sorted(sources.items()):
+    for path in sorted(FOLDER.glob("bench_*.py")):
+        name = path.stem.removeprefix("bench_")
         if name in KEPT_RESULTS:
             continue
         expected, has_measure = _in_module(path)
         # The last run tells the time better than the constant of the module.
         minutes = _result(RESULTS, name).get("minutes", expected)
-        python: tuple[str, ...] = (sys.executable, "-m")
-        if name in OTHERS:
-            module, *arguments = OTHERS[name]
-            command = (*python, f"tests.benchmarks.{module}", *arguments)
-        elif name in IN_CHROOT:
-            run = ("sh", "tests/headset/run_in_root.sh", "env")
-            told = "OCUFILTER_COMMIT={commit}"
-            command = (*run, told, "python", "-m", "tests.benchmarks", name)
-            command += ("--json",) * has_measure
-        else:
-            command = (*python, "tests.benchmarks", name)
+        command: tuple[str, ...] = (sys.executable,)
+        if name in IN_CHROOT:
+            command = ("sh", "tests/headset/run_in_root.sh", "env")
+            command += ("OCUFILTER_COMMIT={commit}", "python")
+        command += ("-m", "tests.benchmarks", name)
+        command += ("--json",) * (name in IN_CHROOT and has_measure)
         is_guess = minutes is None
         minutes = GUESS_MINUTES if minutes is None else float(minutes)
         found[name] = Benchmark(name, command, minutes, is_guess)
@@ -231,7 +223,7 @@ def run_one(
     with tempfile.TemporaryDirectory(dir=LOGS) as out_name, log_path.open("wb") as log:
         out = Path(out_name)
         result = out / f"{bench.name}.json"
-        words = [word.format(commit=commit, out=out) for word in bench.command]
+        words = [word.format(commit=commit) for word in bench.command]
         told = {"OCUFILTER_RESULTS": out_name, "OCUFILTER_COMMIT": commit}
         with (result if is_printed else Path(os.devnull)).open("wb") as printed:
             process = subprocess.Popen(

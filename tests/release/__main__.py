@@ -87,8 +87,8 @@ def quick() -> None:
     check_without_compiler(sdist, BUILD / "first")
     for path in built[0]:
         print(f"{path.name}: {path.stat().st_size / 1e6:.1f} MB; two builds are equal")
-    for line in results.differing(results.commits()):
-        say(f"{line}; `make release` requires results of one commit")
+    if lines := results.differing(results.commits()):
+        say("\n  ".join(["`make release` requires results of one commit", *lines]))
     print(check_metadata(built[0]), end="")
     print(pins.check_pins())
 
