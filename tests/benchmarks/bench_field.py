@@ -37,7 +37,7 @@ from tests.benchmarks.field_methods import (
     Method,
     State,
 )
-from tests.benchmarks.harness import RESULTS, Row, Run
+from tests.benchmarks.harness import Row, Run, written_path
 from tests.benchmarks.image_measures import measures
 from tests.benchmarks.published_figures import CONDITIONS
 from tests.benchmarks.rows import row_of
@@ -252,5 +252,5 @@ def measure(run: Run) -> tuple[list[Row], dict[str, list[dict]]]:
                 rows[row.case, row.setting, row.method] = row
     found = list(rows.values())
     if not run.is_quick:
-        plot_errors(found, RESULTS / "field.png")
+        plot_errors(found, written_path("field.png"))
     return found, {"targets": targets(found)}

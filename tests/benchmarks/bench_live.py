@@ -27,7 +27,7 @@ from filter_service.psfs.store import build_psf_store
 from filter_service.rendering.gl.renderer import FilterRenderer
 from filter_service.rendering.native import NativeRenderer
 from tests.benchmarks.dense_reference import dense_reference
-from tests.benchmarks.harness import RESULTS, Row, Run
+from tests.benchmarks.harness import Row, Run, written_path
 from tests.benchmarks.published_figures import CONDITIONS
 from tests.benchmarks.rows import row_of
 from tests.benchmarks.stream_walks import Moment, courtyard_walk
@@ -203,5 +203,5 @@ def measure(run: Run) -> list[Row]:
             rows += eye_rows(eye, walk, gl)
             print(f"{size_px} {eye}", file=sys.stderr, flush=True)
     if gl is not None:
-        plot_stages(rows, RESULTS / "live.png")
+        plot_stages(rows, written_path("live.png"))
     return rows

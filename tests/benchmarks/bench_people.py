@@ -15,7 +15,7 @@ modulation of a group is the mean over its eyes, not that of the mean wavefront.
 people left out of the population.  The setting of a row has the value of the modeled
 eyes, with the changes by residual refraction and by scattered light (double pass).
 
-A whole run draws results/people_measures.png, too.
+A whole run draws people_measures.png, too.
 """
 
 import itertools
@@ -30,7 +30,7 @@ from estimator.periphery.population import (
     MeasuredEyes,
     load_measured_eyes,
 )
-from tests.benchmarks.harness import OUT, RESULTS, Row, Run
+from tests.benchmarks.harness import Row, Run, written_path
 from tests.benchmarks.people_findings import Finding
 from tests.benchmarks.people_measures_picture import plot_findings
 from tests.benchmarks.people_modulation import REFRACTIONS
@@ -210,8 +210,5 @@ def measure(run: Run) -> list[Row]:
     for name, section in sections.items():
         print(f"people: {name}", file=sys.stderr, flush=True)
         findings += section()
-    is_whole = not quick and run.options.people is None
-    plot_findings(
-        (RESULTS if is_whole else OUT) / "people_measures.png", findings, curves
-    )
+    plot_findings(written_path("people_measures.png"), findings, curves)
     return rows + [row for found in findings for row in found.rows()]

@@ -73,7 +73,9 @@ def test_every_public_make_target_is_phony_and_explained():
 
 
 def test_the_readme_is_short():
-    assert len(text_of("README.md").split()) <= 800
+    # Marks and sources of generated tables are not read.
+    text = re.sub(r"<!--.*?-->|^Measured: .*$", "", text_of("README.md"), flags=re.M)
+    assert len(text.split()) <= 800
 
 
 @pytest.mark.parametrize("document", DOCUMENTS)
