@@ -43,7 +43,7 @@ from tests.benchmarks.published_figures import CONDITIONS
 from tests.benchmarks.rows import row_of
 from tests.numerical.scene_frames import SCENES, scene_view
 
-MINUTES = 55
+MINUTES = 70
 FIXED = State(5.0, 0.5)
 SEED = 5
 REPEATS = 3

@@ -44,7 +44,7 @@ from tests.benchmarks.harness import OUT, ROOT, Row, Run
 from tests.benchmarks.rows import row_of
 from tests.numerical.synthetic import psnr_db
 
-MINUTES = 60
+MINUTES = 15
 SOURCES = tuple(
     Path(__file__).with_name(name) for name in ("witness_script.py", "witness_eye.py")
 )

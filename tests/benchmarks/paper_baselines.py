@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 
 from filter_service.planning.nodes import bracket_axis
 from filter_service.rgbd_view import RgbdView
-from tests.benchmarks.dense_reference import depth_step_dpt
-from tests.benchmarks.depth_sums import DepthSums
+from tests.benchmarks.dense_reference import DepthSums, depth_step_dpt
 from tests.benchmarks.layered_baselines import Filtered, Stopwatch
 from tests.benchmarks.paper_layout import (
     BYTES_PER_TEXEL,
