@@ -11,6 +11,7 @@ import io
 import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from fnmatch import translate
 from pathlib import Path
@@ -199,7 +200,8 @@ class _Table:
         what = cell
         if cell not in (*preset_names(), *published_names()) and cell[0] != "{":
             beside = self._path.parent / cell
-            what = str(beside) if beside.is_file() else cell
+            with suppress(OSError):  # such as a name that is too long
+                what = str(beside) if beside.is_file() else cell
         body = profile_body(what)
         profile = parse_profile(body)
         name, content = profile_name(what, body) or "profile", fingerprint(body)

@@ -12,6 +12,8 @@ from contextlib import suppress
 
 import pytest
 
+from clients.batch.eye_table import read_eyes
+from estimator import InvalidFile
 from estimator.bounded_files import printable
 from estimator.eye.checked_fields import ProfileError
 from estimator.profiles.given_bodies import KINDS
@@ -154,6 +156,13 @@ def test_a_wrong_radius_in_a_list_is_named(value):
     with pytest.raises(ProfileError, match="is not a number") as at:
         parse_profile(body)
     assert at.value.field == "surfaces.0.radius_mm.1"
+
+
+def test_a_profile_of_a_table_whose_name_is_too_long_is_refused(tmp_path):
+    file = tmp_path / "eyes.csv"
+    file.write_text(f"image,profile\n*,{'(' * 5000}\n")
+    with pytest.raises(InvalidFile, match="line 2: profile"):
+        read_eyes(file, named={})
 
 
 def test_a_field_s_name_cannot_forge_lines():
