@@ -201,7 +201,7 @@ class Stream:
             due_s, client = time.monotonic(), self.client
             while not self._is_over.is_set():
                 if self.rate_hz is None:
-                    while client.n_unanswered < self.in_flight:
+                    for _ in range(self.in_flight - client.n_unanswered):
                         self._submit(time.monotonic())
                     self._take(0.05)
                     continue
@@ -229,19 +229,20 @@ class Stream:
         self.due_s[self.client.submit(frame, **self.state(number))] = due_s
 
     def _take(self, wait_s: float) -> None:
+        n_refused = 0
         for event in self.client.poll(wait_s):
             if isinstance(event, FilteredFrame):
                 self._add(event)
             elif isinstance(event, Dropped):
-                self._refused(event.frame_id, event.reason)
+                self._note(event.frame_id, event.reason)
+                n_refused += 1
             elif isinstance(event, ErrorReply):
-                self.errors[event.code] += event.code != "build_cancelled"
+                if event.code != "build_cancelled":
+                    self.errors[event.code] += 1
                 if event.frame_id is not None:
-                    self._refused(event.frame_id, event.code)
-
-    def _refused(self, frame_id: int, kind: str) -> None:
-        self._note(frame_id, kind)
-        if self.rate_hz is None:  # the next one would be refused at once
+                    self._note(event.frame_id, event.code)
+                    n_refused += 1
+        if n_refused and self.rate_hz is None:  # the next one would be refused at once
             time.sleep(RETRY_S)
 
     def _note(self, frame_id: int, kind: str, **more) -> None:
