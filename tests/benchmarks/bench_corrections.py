@@ -71,7 +71,7 @@ PEAK_LEAST = 0.08
 BEFORE_PUPIL_MM = 15.05
 KERNELS = 96
 STATES, IMAGES_PX = 100, ((480, 270), (1280, 720))
-MINUTES = 0
+MINUTES = 5
 
 
 row = partial(row_of, "corrections")

@@ -7,13 +7,9 @@
   as large.  A client's share is the time in which its frames were filtered, over that
   of both; error: how far it is from a half (goal 0.1 of it).  The case has what its
   frames take alone.
-- ``devices``: two engines of one thread behind one socket, and one engine of two
-  threads.  Clients take turns in rounds, so that whatever else the machine does falls
-  on all.  Errors: how far the frames per second of all clients are from twice those of
-  one alone in the same round; how far the slowest client is from an equal share.  As
-  two cores leave none for the clients, the same is measured of engines that sleep for
-  50 ms.  ``one killed``: the other client's periods before and meanwhile, and the time
-  to the next picture of the struck one; error: frames that were not filtered.
+- ``one of two killed``: two engines of one thread behind one socket, of which one is
+  killed: the other client's periods before and meanwhile, and the time to the next
+  picture of the struck one.  Error: frames that were not filtered.
 - ``first frame`` and ``whole eye``: from the end of the render worker of a live stream
   to the next picture, and to one through the whole eye.  Error: RMS of the latter less
   the same frame before, in levels of 255.
@@ -32,7 +28,6 @@ import sys
 import tempfile
 import time
 from collections import Counter, defaultdict
-from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 
@@ -41,18 +36,16 @@ import numpy as np
 from clients.service_process import SERVE_COMMAND, ServiceProcess
 from tests.benchmarks.harness import Row, Run
 from tests.benchmarks.rows import row_of
-from tests.benchmarks.service_stream import PROFILE, Stream, processor_s, view_of
+from tests.benchmarks.service_stream import PROFILE, Stream, view_of
 
-MINUTES = 30
-CASES = ("overload", "sharing", "devices", "killed", "restart", "upgrade", "soak")
+MINUTES = 24
+CASES = ("overload", "sharing", "killed", "restart", "upgrade", "soak")
 RATE_HZ = 30.0
 TOO_FAST = 3.0
 N_ALONE = 12
 SETTLE_S, SETTLE_RESTART_S = 3.0, 12.0  # by then, a process that stands by is ready
 UPGRADE_S = 3.0  # before the upgrade, and after the first frame of the new service
 
-TWO, WHOLE, SLEEP_MS = ("native:1",) * 2, ("native:2",), 50
-DOUBLE = (sys.executable, "-m", "tests.end_to_end.double_service")
 STATIC = {
     "pupil_range_mm": (4.0, 4.0),
     "focus_range_dpt": (0.0, 0.0),
@@ -158,83 +151,14 @@ def sharing_rows(quick: bool) -> list[Row]:
     return rows
 
 
-def opened(closing: ExitStack, devices, count: int, *, sleeps: bool = False):
-    """Return a service, and streams whose eyes are ready."""
-    command = (*DOUBLE, "--filter-ms", str(SLEEP_MS)) if sleeps else SERVE_COMMAND
-    settings = {"devices": list(devices)}
-    service = closing.enter_context(ServiceProcess(settings, command=command))
-    profile = {"kind": "double", "mark": 1} if sleeps else PROFILE
-    view, streams = view_of((1280, 720)), []
-    for _ in range(count):
-        streams.append(Stream(service.endpoint, view, profile=profile, settings=STATIC))
-        closing.callback(streams[-1].client.close)
-    return service, streams
-
-
-def devices_rows(quick: bool) -> list[Row]:
-    """Let one, two and four clients take turns, on two engines and on one."""
-    rounds, seconds = (2, 1.5) if quick else (10, 2.5)
-    rows, found = [], defaultdict(list)
-    with ExitStack() as closing:
-        two, streams = opened(closing, TWO, 4)
-        whole, others = opened(closing, WHOLE, 2)
-        asleep, sleepers = opened(closing, TWO, 2, sleeps=True)
-        cases = {
-            "two engines of a thread, 1 client": (two, streams[:1]),
-            "two engines of a thread, 2 clients": (two, streams[:2]),
-            "two engines of a thread, 4 clients": (two, streams),
-            "one of two threads, 2 clients": (whole, others),
-            "two that sleep, 1 client": (asleep, sleepers[:1]),
-            "two that sleep, 2 clients": (asleep, sleepers),
-        }
-        for _ in range(rounds):
-            for name, (service, clients) in cases.items():
-                time.sleep(0.5)
-                before_s = processor_s(service.pids().values())
-                for stream in clients:
-                    stream.start()
-                time.sleep(seconds)
-                for stream in clients:
-                    stream.stop()
-                used_s = processor_s(service.pids().values()) - before_s
-                times_s = [[o.at_s for o in s.filtered()] for s in clients]
-                # Whole periods of each, without the first.
-                hz = sum((len(t) - 1) / (t[-1] - t[0]) for t in times_s)
-                counts = [len(t) for t in times_s]
-                unfair = 1.0 - min(counts) / float(np.mean(counts))
-                periods_ms = [1e3 * p for t in times_s for p in np.diff(t)]
-                found[name].append((hz, unfair, 1e3 * used_s / sum(counts), periods_ms))
-        for name, (service, _) in cases.items():
-            alone = "two that sleep, 1 client" if "sleep" in name else next(iter(cases))
-            hz, unfair, cpu_ms, periods = zip(*found[name], strict=True)
-            times = np.array(hz) / np.array([one[0] for one in found[alone]])
-            text = f"{np.median(hz):.2f} frames/s, {np.median(times):.2f} x one"
-            periods_ms = np.concatenate(periods)
-            errors = {
-                "short_of_twice": 1.0 - float(np.median(times)) / 2.0,
-                "short_of_equal_share": float(np.median(unfair)),
-            }
-            of = "one client alone on one of the engines, in the same round"
-            for what, case, values, error_name, error in (
-                *((name, text, periods_ms, *one) for one in errors.items()),
-                (name, "processor", cpu_ms, "none", 0.0),
-            ):
-                rows.append(
-                    row(
-                        *(what, case, "1280x720, -2 dpt, 4 mm", values),
-                        *(error_name, error, of),
-                        used_mb=service.memory_mb,
-                    )
-                )
-    return rows
-
-
 def killed_rows(quick: bool) -> list[Row]:
     """Kill the engine of one of two clients while both stream."""
-    with ExitStack() as closing:
-        service, (struck, other) = opened(closing, TWO, 2)
-        for stream in (struck, other):
-            stream.start()
+    view = view_of((1280, 720))
+    with (
+        ServiceProcess({"devices": ["native:1", "native:1"]}) as service,
+        Stream(service.endpoint, view, settings=STATIC) as struck,
+        Stream(service.endpoint, view, settings=STATIC) as other,
+    ):
         time.sleep(2.0 if quick else 4.0)
         os.kill(service.pids()["render 0"], signal.SIGKILL)
         killed_s = time.monotonic()
@@ -442,7 +366,6 @@ def measure(run: Run) -> tuple[list[Row], dict[str, list[dict]]]:
     simple = {
         "overload": overload_rows,
         "sharing": sharing_rows,
-        "devices": devices_rows,
         "killed": killed_rows,
         "restart": restart_rows,
         "soak": soak_rows,

@@ -33,7 +33,7 @@ from tests.file_mutants import Kind, kinds, mutant
 
 N_READS, N_COMMANDS = 100_000, 500
 QUICK_READS, QUICK_COMMANDS = 250, 4
-MINUTES = 35
+MINUTES = 25
 N_PROCESSES = 2
 COMMAND_S = 60.0
 MAX_READ_S, MAX_MEMORY_MB = 5.0, 1000.0
