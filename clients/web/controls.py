@@ -166,7 +166,7 @@ DISTANCES_M = {"6 m": 6.0, "4 m": 4.0, "1 m": 1.0, "66 cm": 0.66, "40 cm": 0.4}
 
 BY_HAND = "hand"
 LIGHTS: dict[str, tuple[str, float]] = {
-    BY_HAND: ("Pupil as set by the slider", 0.0),
+    BY_HAND: ("Set by the slider", 0.0),
     "moon": ("Moonlit street, 0.03 cd/m²", 0.03),
     "night": ("Lit road at night, 1 cd/m²", 1.0),
     "room": ("Living room, 30 cd/m²", 30.0),

@@ -30,10 +30,9 @@ RESIDUAL = (
     "3 mm, by some +0.2 dpt without a compensating lens."
 )
 HELP: dict[WornKind, str] = {
-    "iol": "An implant replaces the natural lens. The power of the implant is chosen "
-    "for the refraction that remains. "
-    f"{RESIDUAL} Accommodation, and haze and yellowing of the natural lens, are gone. "
-    + SPHERICAL.format("lens adds"),
+    "iol": "An implant replaces the natural lens. Its power is chosen for the "
+    f"refraction that remains. {RESIDUAL} Accommodation, and haze and yellowing of the "
+    "natural lens, are gone. " + SPHERICAL.format("lens adds"),
     "laser": f"{RESIDUAL} " + SPHERICAL.format("surgery adds"),
 }
 """Details, behind a button."""

@@ -473,8 +473,9 @@ class Page:
             return
         notes = seen.facts.get("notes") or [seen.facts.get("error", "")]
         sentences = [f"{n[:1].upper()}{n[1:].rstrip('.')}." for n in notes if n]
-        stopped = [note for note in sentences if "accommodation stops" in note]
-        if any("stops at 0 dpt" not in note for note in stopped):
+        worn = self.state.valid_profiles.get(seen.eye, {}).get("correction") or {}
+        has_lens = worn.get("kind") != "iol"
+        if has_lens and any("accommodation stops" in note for note in sentences):
             sentences.append(AMPLITUDE)
         self._notes[seen.eye] = " ".join(sentences)
         self._show_notes()
