@@ -63,6 +63,16 @@ YOUNG_CATARACT = (
 TYPING_MS = 400
 """Pause after which a typed number is used; an incomplete one would be another eye."""
 
+FOCUS = """setTimeout(() => {
+  const box = document.querySelector("[data-eye-panel=%s] [data-choice='%s']");
+  if (!box || document.activeElement !== document.body) return;
+  const pressed = box.querySelector("[aria-pressed=true]");
+  const part = pressed ?? (box.matches("input, [tabindex]") ? box
+    : box.querySelector("input, [tabindex]"));
+  part?.focus({preventScroll: true});
+}, 100)"""
+"""Gives the keyboard focus to a choice that replaced the one that had it."""
+
 ChangeHandler = Callable[[events.ValueChangeEventArguments], None]
 
 
@@ -128,6 +138,8 @@ class EyePanel:
         self._media()
         ui.separator()
         self._correction()
+        for field, choice in self._choices.items():
+            choice.props["data-choice"] = field
         self.mark(self._marked)
 
     def mark(self, paths: Collection[str]) -> None:
@@ -327,8 +339,12 @@ class EyePanel:
         """
 
         def handle(event: events.ValueChangeEventArguments) -> None:
+            choices = self._choices.items()
+            name = next((n for n, choice in choices if choice is event.sender), "")
             take(event.value)
             self.changed() if rebuilds else self._on_change()
+            if rebuilds and name in self._choices:
+                self.box.client.run_javascript(FOCUS % (self.name, name))
 
         return handle
 

@@ -315,3 +315,19 @@ def test_no_file_yet_is_not_an_error(page):
     page.page.wait_for_timeout(600)
     assert page.page.get_by_text("no file yet").count() == 0
     assert page.page.get_by_text("No file yet").count() == 0
+
+
+def test_the_keyboard_stays_where_entries_are_rebuilt(page):
+    switch = page.page.get_by_role("switch", name="Wears a correction").first
+    switch.focus()
+    page.page.keyboard.press("Space")
+    page.page.locator(".oc-worn-kind").wait_for()
+    page.page.wait_for_function("document.activeElement !== document.body")
+    assert switch.evaluate("element => element.contains(document.activeElement)")
+    page.page.get_by_role("button", name="Preset", exact=True).first.focus()
+    page.page.keyboard.press("Enter")
+    page.page.locator(".oc-eye [aria-label=Preset]").first.wait_for()
+    page.page.wait_for_function(
+        "document.activeElement.getAttribute('aria-pressed') === 'true'"
+    )
+    assert page.page.evaluate("document.activeElement.innerText") == "Preset"
