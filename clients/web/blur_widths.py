@@ -5,19 +5,18 @@ from __future__ import annotations
 import math
 
 WIDTHS_ARCMIN = {
-    "half a stroke of a letter of the 1.0 (20/20) line": 0.5,
-    "two thirds of a stroke of a letter of the 1.0 (20/20) line": 0.7,
-    "a stroke of a letter of the 1.0 (20/20) line": 1.0,
-    "a stroke of a letter of the 0.7 (20/29) line": 1.4,
-    "a stroke of a letter of the 0.5 (20/40) line": 2.0,
-    "a stroke of a letter of the 0.35 (20/57) line": 2.8,
-    "a stroke of a letter of the 0.25 (20/80) line": 4.0,
-    "a letter of the 1.0 (20/20) line": 5.0,
-    "a letter of the 0.7 (20/29) line": 7.0,
-    "a letter of the 0.5 (20/40) line": 10.0,
-    "a letter of the 0.35 (20/57) line": 14.0,
-    "a letter of the 0.25 (20/80) line": 20.0,
-    "a letter of the 0.2 (20/100) line": 25.0,
+    "a hair at arm's length": 0.5,
+    "one and a half hairs at arm's length": 0.75,
+    "two hairs side by side at arm's length": 1.0,
+    "the edge of a postcard at arm's length": 1.4,
+    "the stroke of a fine pen at arm's length": 2.0,
+    "a thin pencil lead at arm's length": 2.9,
+    "the edge of a bank card at arm's length": 4.3,
+    "a fifth of the full moon": 6.2,
+    "a quarter of the full moon": 7.8,
+    "a third of the full moon": 10.4,
+    "half the full moon": 15.5,
+    "two thirds of the full moon": 20.7,
     "the full moon": 31.0,
     "one and a half full moons": 45.0,
     "a little finger at arm's length": 60.0,
@@ -31,7 +30,12 @@ WIDTHS_ARCMIN = {
     "one and a half fists at arm's length": 900.0,
     "a spread hand at arm's length": 1200.0,
 }
-"""Visual angles of familiar things, in steps of at most 1.5."""
+"""Visual angles of familiar things, in steps of at most 1.5.
+
+Widths at 60 cm: a hair of 0.09 mm, a postcard of 0.25 mm, a pen of 0.35 mm, a lead of
+0.5 mm, a bank card of 0.76 mm (ISO/IEC 7810).  Rows of a chart would be read as an
+acuity, which a spot is not.
+"""
 
 
 def nearest_familiar_object(radius_arcmin: float) -> str:

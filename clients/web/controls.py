@@ -176,6 +176,9 @@ LIGHTS: dict[str, tuple[str, float]] = {
 }
 """Levels of light: text, and mean luminance in cd/m²."""
 
+SCENE_LIGHTS = {"night_road": "night"}
+"""Level of light that a scene sets when it is chosen, a key of `LIGHTS`."""
+
 LIT_FIELD_DEG2 = 2827.0
 """Area of the adapting field: a disk of 60 deg."""
 

@@ -30,6 +30,8 @@ EYE_HELP = (
     "Describe the eye by its prescription, a preset or a file. A normal eye of 30 "
     "years is not perfect: it blurs toward the side and has slight aberrations and "
     "colored fringes, which the picture shows and which its owner does not notice. "
+    "The age limits accommodation to the amplitude that instruments measure; a push-up "
+    "measurement includes the depth of focus and is higher. "
     "“Compare” adds a second state of the same eye, B, which starts as a copy of A: "
     "change what differs, such as the correction or the age. Differences are marked."
 )

@@ -4,28 +4,27 @@ from __future__ import annotations
 
 import base64
 import json
-import math
 from collections.abc import Callable
 from typing import Any
 
 from nicegui import events, ui
 
-from clients.scenes.letter_chart import smallest_row
 from clients.web.blur_widths import nearest_familiar_object
 from clients.web.comparison import EyeName
-from clients.web.controls import DISTANCE, distance_text
+from clients.web.controls import distance_text
 from clients.web.figure_worker import (
     FIGURE_TITLES,
     Ask,
     FigureFailed,
     eye_figures,
     point_spread,
-    predicted_log_mar,
+    predicted_sight,
 )
 from clients.web.page_state import PageState
 from clients.web.widgets import card, help_button, title, toggle
 
 LEAST_OFFSET_DEG = 0.05
+PREPARING = "Preparing the point of light of these entries…"
 
 POINT_HELP = (
     "The image of a single point of light on the retina, at the pointer. The smaller "
@@ -152,6 +151,13 @@ class FigurePanel:
         body = self._state.profile_at_gaze(name)
         return None if body is None else json.dumps(body, sort_keys=True)
 
+    def mark_outdated(self) -> None:
+        """Say that the points of light shown are those of former entries."""
+        self._message.text = PREPARING
+        for psf in self._psfs:
+            if psf.content:
+                psf.classes("oc-outdated")
+
     async def _show_point(self) -> None:
         """Show the point of light of the eye at the pointer, or of both states."""
         state = self._state
@@ -160,6 +166,7 @@ class FigurePanel:
             names = state.names[:1]
         for psf in self._psfs[len(names) :]:
             psf.content = ""
+            psf.classes(remove="oc-outdated")
         messages: list[str] = []
         for name, psf in zip(names, self._psfs, strict=False):
             body, picture = self._body(name), state.picture
@@ -179,36 +186,33 @@ class FigurePanel:
             png, facts = answer
             shown = state.title(name)
             psf.content = _image(png, f"Image of the point of light, {shown}")
+            psf.classes(remove="oc-outdated")
             start = f"{shown}: " if state.is_comparing else ""
             if not messages:
                 start = f"{describe_place(facts)} {start}"
             messages.append(start + describe_width(facts))
         self._message.text = "\n".join(messages)
 
-    async def smallest_rows(self) -> dict[EyeName, int | None] | None:
-        """Return the smallest chart row that each eye can read; None if it reads none.
+    async def sights(self) -> dict[EyeName, dict[str, Any]] | None:
+        """Return the acuity of each eye for what it looks at: see `sight_numbers`.
 
-        Return None if a request failed or was superseded.  An eye whose acuity is
-        unknown is omitted.
+        Return None if a request failed or was superseded.
         """
-        picture = self._state.picture
-        rows = [row.log_mar for row in picture.chart_rows] if picture else []
-        found: dict[EyeName, int | None] = {}
-        for name in self._state.names if rows else ():
+        found: dict[EyeName, dict[str, Any]] = {}
+        for name in self._state.names:
             body = self._body(name)
             if body is None:
                 continue
-            log_mar = await self._answer(
+            sight = await self._answer(
                 f"acuity {name}",
-                predicted_log_mar,
+                predicted_sight,
                 body,
-                object_dpt=self._state.values[DISTANCE.name],
+                object_dpt=self._state.object_dpt,
                 **self._state.eye_state,
             )
-            if log_mar is None:
+            if sight is None:
                 return None
-            if not math.isnan(log_mar):
-                found[name] = smallest_row(rows, log_mar)
+            found[name] = sight
         return found
 
     async def _show_figure(self) -> None:

@@ -25,7 +25,6 @@ from PIL import Image, ImageDraw, ImageFont
 from clients.figures import (
     EyeStudy,
     PupilWavefront,
-    acuity_log_mar,
     cross_section_figure,
     draw_acuity_of_several,
     draw_mtf,
@@ -38,6 +37,7 @@ from clients.figures.curves import blur_arcmin, draw_field_map
 from clients.figures.style import new_figure
 from clients.web.comparison import joined_png
 from clients.web.picture import png_of
+from clients.web.sight import sight_numbers
 from estimator import (
     EyeOptics,
     Rings,
@@ -294,14 +294,9 @@ def eye_figure(
     return _png(figure)
 
 
-def predicted_log_mar(
-    body: str, *, pupil_diameter_mm: float, focus_dpt: float, object_dpt: float
-) -> float:
-    """Return the acuity of an eye at a distance; not finite if it is unknown."""
-    seen = _study(body).wavefront(
-        pupil_diameter_mm, object_dpt=object_dpt, focus_dpt=focus_dpt
-    )
-    return acuity_log_mar(seen)
+def predicted_sight(body: str, **state: float) -> dict[str, Any]:
+    """Return the acuity of an eye at a distance: see `sight_numbers`."""
+    return sight_numbers(_study(body), **state)
 
 
 def _field_figure(study: EyeStudy) -> Figure:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import math
 import secrets
 from collections.abc import Mapping
 from functools import partial
@@ -13,6 +14,7 @@ from fastapi import Response
 from fastapi.responses import HTMLResponse
 from nicegui import Client, app, background_tasks, events, run, ui
 
+from clients.scenes.letter_chart import smallest_row
 from clients.web.comparison import EYE_NAMES, EyeName, side_of
 from clients.web.controls import (
     AGE,
@@ -23,6 +25,7 @@ from clients.web.controls import (
     GAZE_V,
     LIGHTS,
     PUPIL,
+    SCENE_LIGHTS,
     NumberField,
     distance_text,
 )
@@ -34,9 +37,17 @@ from clients.web.filter_thread import FilterThread, SentPicture
 from clients.web.guard import FULL, MAX_PAGES, page_of
 from clients.web.header import Header
 from clients.web.page_state import SCENES, PageState, restore
+from clients.web.page_texts import (
+    CONDITIONS_HELP,
+    HAZE_OFFER,
+    NORMAL,
+    NOT_MEDICAL,
+    PICTURE_HELP,
+)
 from clients.web.picture import Picture, SceneNotRendered, png_of, scene_picture
 from clients.web.picture_panel import PictureSender, PictureView, ScenePanel
 from clients.web.scenario_menu import ScenarioMenu
+from clients.web.sight import eye_sentences
 from clients.web.widgets import (
     Delayed,
     SliderRow,
@@ -67,33 +78,6 @@ CONNECT_S = 30.0
 RESPONSE_S = 120.0
 """Time limit for building a page.  It takes 0.35 s, and pages are built one at a time:
 as many as may be open wait for each other."""
-
-AMPLITUDE = (
-    "The amplitude is objective accommodation; a push-up measurement also includes "
-    "the depth of focus and is higher."
-)
-
-PICTURE_HELP = (
-    "Left of the divider is the scene, right of it what the eye sees; in a comparison, "
-    "A and B. Drag the divider, or hold a button to see one of them alone. A click "
-    "focuses the eye on what is there. The picture is sharpest in the direction of the "
-    "gaze, the center: objects at the side are blurred, as in every eye."
-)
-CONDITIONS_HELP = (
-    "They hold for all pictures. “Light” sets the pupil by the luminance of the "
-    "surroundings and the age (Watson and Yellott 2012). The focus is the "
-    "distance that the eye looks at; “Distance” is that of the letter chart or of a "
-    "photograph without depth. The pencil beside a slider takes a typed value, such as "
-    "6 m, 40 cm, 20 ft or 2.5 dpt."
-)
-NORMAL = (
-    "Every eye is sharp only where it looks: what is at the side is blurred, and dark "
-    "edges have colored fringes. People do not notice either in their own sight."
-)
-NOT_MEDICAL = (
-    "Not a medical device: for demonstration and research. It models the optics of an "
-    "eye, not its health, and does not replace an examination."
-)
 
 PICTURES_PATH = "/pictures/"
 
@@ -140,7 +124,8 @@ class Page:
         self.sender = resources.picture_senders[self.name] = PictureSender()
         self._figure_refresh = Delayed(FIGURES_DELAY_S)
         self._announcement = Delayed(STATUS_DELAY_S)
-        self._notes: dict[EyeName, str] = {}
+        self._notes: dict[EyeName, list[str]] = {}
+        self._sights: dict[EyeName, dict[str, Any]] = {}
         self._rows_read: dict[EyeName, int | None] = {}
         self.rows: dict[str, SliderRow] = {}
         loop = asyncio.get_running_loop()
@@ -177,12 +162,7 @@ class Page:
                 with ui.element("div").classes("oc-middle"):
                     self._picture_card()
                     self._sliders_card()
-                    with ui.element("div").classes("oc-told"):
-                        self.eyes.build_differences()
-                        self.scenarios.build_text()
-                        self._note = ui.label("").classes("oc-note")
-                        self._note.props("aria-live=polite")
-                        ui.label(NORMAL).classes("oc-hint")
+                    ui.label(NORMAL).classes("oc-hint oc-told")
                     with ui.element("div").classes("oc-results"):
                         self.figures.build_figure()
             self._show_views()
@@ -212,6 +192,15 @@ class Page:
                 self._status = ui.label("").classes("oc-status")
                 self._status.props("role=status aria-live=polite")
                 help_button("the picture", PICTURE_HELP)
+            with self.view.add_slot("told"):
+                self._note = ui.label("").classes("oc-note oc-sight")
+                self._note.props("aria-live=polite")
+            with ui.element("div").classes("oc-sentences"):
+                self.scenarios.build_text()
+                self.eyes.build_differences()
+                with ui.element("div").classes("oc-look-group") as self._haze_offer:
+                    ui.label(HAZE_OFFER).classes("oc-hint")
+                    small_button("Add straylight of this age", self._add_haze)
             self._scene_problem = problem_label()
 
     def _sliders_card(self) -> None:
@@ -315,8 +304,10 @@ class Page:
         request = self.state.request()
         self._report_problems()
         self.eyes.show_differences()
+        self._show_haze_offer()
         if request is None:
             return
+        self._forget_figures()
         self.view.show(alts={name: self._alt(name) for name in self.state.names})
         self._announcement.call(
             self._status.set_text,
@@ -342,19 +333,39 @@ class Page:
             f"{distance_text(values[FOCUS.name])}"
         )
 
+    def _forget_figures(self) -> None:
+        """Hide sentences and figures of former entries until those of these are known.
+
+        The rows of a chart lose their marks, and points of light are shown as outdated.
+        """
+        self._notes, self._sights = {}, {}
+        self._show_notes()
+        self.figures.mark_outdated()
+        if self._rows_read:
+            self._rows_read = {}
+            self._mark_rows()
+
     async def _refresh_figures(self) -> None:
+        number = self.state.number
+        found = await self.figures.sights()
         picture = self.state.picture
-        if picture is not None:
+        if found is not None and picture is not None and number == self.state.number:
+            self._sights = found
+            self._show_notes()
             # label the rows of a chart; mark the smallest one that each eye can read
-            read = await self.figures.smallest_rows()
-            shown = self.state.picture
-            if read is not None and shown and shown.chart_rows == picture.chart_rows:
-                self._rows_read = read
+            rows = [row.log_mar for row in picture.chart_rows]
+            self._rows_read = {
+                name: smallest_row(rows, sight["log_mar"])
+                for name, sight in found.items()
+                if rows and not math.isnan(sight["log_mar"])
+            }
+            if rows:
                 self._mark_rows()
         await self.figures.refresh()
 
     def _mark_rows(self) -> None:
-        """Label the rows of a chart in the chosen notation."""
+        """Label the rows of a chart, and name acuities, in the chosen notation."""
+        self._show_notes()
         if self.state.picture is not None:
             notation = self.state.notation
             self.view.mark_rows(self.state.picture, self._rows_read, notation)
@@ -373,6 +384,19 @@ class Page:
             self.state.set_light(event.value)
             self._show_values()
             self.request()
+
+    def _show_haze_offer(self) -> None:
+        forms = [self.state.form(name) for name in self.state.names]
+        lacks_haze = any(form.haze == "none" for form in forms)
+        is_night = self.scene.kind in SCENE_LIGHTS
+        self._haze_offer.set_visibility(is_night and lacks_haze)
+
+    def _add_haze(self) -> None:
+        for name in self.state.names:
+            if self.state.form(name).haze == "none":
+                self.state.form(name).haze = "age"
+        self.eyes.refresh()
+        self.request()
 
     def _set_distance(self, meters: float) -> None:
         self.state.move(DISTANCE.name, round(1.0 / meters, 4))
@@ -416,6 +440,7 @@ class Page:
             eyes=list(state.names),
             labels_of={name: state.title(name) for name in state.names},
             behind_one=state.is_comparing and state.arrangement == "divider",
+            whole=state.is_comparing and state.arrangement == "beside",
         )
         self._arrangement.set_visibility(state.is_comparing)
         self._show_notes()
@@ -451,6 +476,7 @@ class Page:
         self._note.set_visibility(not text)
 
     def _set_picture(self, picture: Picture) -> None:
+        self.state.adapt_to(self.scene.kind)
         self.state.set_picture(picture)
         self.scenarios.leave_unless(self.scene.kind)
         self._show_values()
@@ -471,25 +497,29 @@ class Page:
         self.sender.put(seen)
         if seen.eye is None or seen.kind not in ("full", "failed"):
             return
-        notes = seen.facts.get("notes") or [seen.facts.get("error", "")]
-        sentences = [f"{n[:1].upper()}{n[1:].rstrip('.')}." for n in notes if n]
-        worn = self.state.valid_profiles.get(seen.eye, {}).get("correction") or {}
-        has_lens = worn.get("kind") != "iol"
-        if has_lens and any("accommodation stops" in note for note in sentences):
-            sentences.append(AMPLITUDE)
-        self._notes[seen.eye] = " ".join(sentences)
-        self._show_notes()
         number, names = self.state.number, self.state.names
-        if seen.number == number and all(
-            self.sender.is_final(name, number) for name in names
-        ):
+        if seen.number != number:
+            return
+        notes = seen.facts.get("notes") or [seen.facts.get("error", "")]
+        self._notes[seen.eye] = [note for note in notes if note]
+        self._show_notes()
+        if all(self.sender.is_final(name, number) for name in names):
             self._announcement.cancel()
             result = "full picture." if seen.kind == "full" else "no picture."
             titles = self.state.titles
             self._status.text = f"{titles[:1].upper()}{titles[1:]}: {result}"
 
+    def _sentences(self, name: EyeName) -> str:
+        return eye_sentences(
+            self._sights.get(name),
+            self._notes.get(name, ()),
+            self.state.valid_profiles.get(name, {}),
+            object_dpt=self.state.object_dpt,
+            notation=self.state.notation,
+        )
+
     def _show_notes(self) -> None:
-        notes = {name: self._notes.get(name, "") for name in self.state.names}
+        notes = {name: self._sentences(name) for name in self.state.names}
         if len(notes) == 1:
             (self._note.text,) = notes.values()
         else:

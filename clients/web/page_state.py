@@ -36,6 +36,7 @@ from clients.web.controls import (
     GAZE_V,
     LIGHTS,
     PUPIL,
+    SCENE_LIGHTS,
     NumberField,
     initial_values,
     pupil_by_light_mm,
@@ -74,7 +75,7 @@ READING_GAZE_DEG = -30.0
 
 VERSION = 1
 MAX_CHARACTERS = 8000
-"""Length limit of a fragment; every entry of four states takes 3,600 characters."""
+"""Limit of a fragment; all entries of four states take 3,600 characters."""
 
 MAX_ENTRY_CHARACTERS = 40
 SCENES = ("courtyard", "primitives", "night_road", "stairs", "chart")
@@ -102,6 +103,7 @@ class PageState:
     number : number of the last request
     keeps_focus : whether the next picture keeps the focus, as it came with the link or
         the scenario that selected it
+    light_before : light and pupil before a scene set them, or None
     valid_profiles : the last valid profile of each eye
     """
 
@@ -123,6 +125,7 @@ class PageState:
     pipeline: Pipeline = "exact"
     number: int = 0
     keeps_focus: bool = False
+    light_before: tuple[str, float] | None = None
     valid_profiles: dict[EyeName, Mapping[str, Any]] = field(default_factory=dict)
 
     @property
@@ -165,10 +168,7 @@ class PageState:
     def body(self, name: EyeName) -> dict[str, Any]:
         """Return the profile of an eye or of its state B.
 
-        Raises
-        ------
-        ValueError
-            An invalid entry: its value and the allowed ones.
+        Raise ValueError for an invalid entry: its value and the allowed ones.
         """
         return self.form(name).body(age_years=self.values[self.age(name).name])
 
@@ -223,6 +223,16 @@ class PageState:
         return {number.name: self.values[number.name] for number in (PUPIL, FOCUS)}
 
     @property
+    def is_flat(self) -> bool:
+        """Return whether all of the picture is at one distance."""
+        return self.picture is not None and self.picture.distance_dpt is not None
+
+    @property
+    def object_dpt(self) -> float:
+        """Return the distance of a flat picture; in a scene, that of the focus."""
+        return self.values[(DISTANCE if self.is_flat else FOCUS).name]
+
+    @property
     def gaze_deg(self) -> tuple[float, float]:
         """Return the gaze relative to straight ahead of the head."""
         return self.values[GAZE_H.name], self.values[GAZE_V.name]
@@ -243,8 +253,7 @@ class PageState:
 
         The focus on a flat picture ends with it: a scene has its own initial focus.
         """
-        was_flat = self.picture is not None and self.picture.distance_dpt is not None
-        is_left = was_flat and picture.distance_dpt is None
+        is_left = self.is_flat and picture.distance_dpt is None
         if is_left and not self.keeps_focus:
             self.values[FOCUS.name] = round(picture.focus_dpt or 0.0, FOCUS.digits)
             self.is_focus_set = False
@@ -261,8 +270,7 @@ class PageState:
             self._focus_on_picture()
 
     def _focus_on_picture(self) -> None:
-        is_flat = self.picture is not None and self.picture.distance_dpt is not None
-        if is_flat and not self.is_focus_set:
+        if self.is_flat and not self.is_focus_set:
             self.values[FOCUS.name] = min(self.values[DISTANCE.name], FOCUS.high)
 
     def move(self, name: str, value: float) -> None:
@@ -286,6 +294,19 @@ class PageState:
         if light != BY_HAND:
             pupil_mm = pupil_by_light_mm(light, self.values[AGE.name])
             self.values[PUPIL.name] = pupil_mm
+
+    def adapt_to(self, scene: str) -> None:
+        """Set the light of a scene chosen by hand, and undo it when the scene is left.
+
+        A link or a scenario has its own pupil.
+        """
+        light, before = SCENE_LIGHTS.get(scene), self.light_before
+        self.light_before = None
+        if light is not None and not self.keeps_focus:
+            self.light_before = before or (self.light, self.values[PUPIL.name])
+            self.set_light(light)
+        elif before is not None and self.light in SCENE_LIGHTS.values():
+            self.light, self.values[PUPIL.name] = before
 
     def look(self, *, is_reading: bool) -> None:
         """Look straight ahead and far, or down at a reading distance."""
@@ -333,14 +354,8 @@ class PageState:
 
         A file that is loaded into state A or B of a comparison stays there.
 
-        Returns
-        -------
-        The eye that was loaded.
-
-        Raises
-        ------
-        ValueError
-            Not a profile; nothing has changed.
+        Return the eye that was loaded.  Raise ValueError if it is not a profile;
+        nothing has changed.
         """
         body = read_profile_file(name, content)
         loaded = eye if self.is_comparing else body.get("eye_side", eye)
@@ -356,13 +371,13 @@ class PageState:
         self.values.update(initial_values())
         self.shown, self.is_focus_set, self.pipeline = "OD", False, "exact"
         self.wants_comparison, self.arrangement = False, "divider"
-        self.keeps_focus, self.light = False, BY_HAND
+        self.keeps_focus, self.light, self.light_before = False, BY_HAND, None
         self.notation = "decimal"
 
     def read_profiles(self) -> bool:
         """Read the profiles of the eyes shown; return whether any has changed.
 
-        An eye with an invalid entry keeps its last profile: see `problems`.
+        An eye with an invalid entry keeps its last one: see `problems`.
         """
         before = dict(self.valid_profiles)
         for name in self.names:
@@ -472,8 +487,7 @@ class Restored(NamedTuple):
 def restore(state: PageState, fragment: str) -> Restored:
     """Set a page's entries from a fragment; report rejected entries.
 
-    Entries are validated like typed ones.  Invalid and missing ones get their initial
-    values.
+    They are validated like typed ones; invalid and missing ones get initial values.
     """
     entries = _read(fragment)
     if entries is None:

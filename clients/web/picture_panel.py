@@ -394,6 +394,7 @@ class PictureView(Element, component="picture_view.js"):  # type: ignore[call-ar
             eyes=[],
             labels_of={},
             behind_one=False,
+            whole=False,
             aspect=aspect,
             scene="",
             alts={},
@@ -413,6 +414,8 @@ class PictureView(Element, component="picture_view.js"):  # type: ignore[call-ar
         behind_one : bool
             Whether two states share one split, instead of each having one beside the
             scene.
+        whole : bool
+            Whether each picture is shown whole, without the scene and a split.
         scene, aspect : str, float
             Title of the scene, and the ratio of its width to its height.
         empty : str

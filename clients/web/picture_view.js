@@ -8,6 +8,7 @@ const POINT_MS = 90; // between two reports of the pointer position
 const RECONNECT_MS = 1000;
 const LINE_PX = 16; // height of a label beside a row of the chart
 const LABELS_EM = 7; // width of the labels, in their own font size
+const NARROW_EM = 3.6; // less, if only one notation is shown
 const FRACTION_EM = 1.4; // by which fractions such as 20/200 are wider
 const LEAST_LINE_PX = 11; // smaller labels are illegible; only the caption is shown
 
@@ -31,26 +32,26 @@ export default {
                 <line v-for="mark in labels" :x1="100 * mark.x + 1 + '%'" :y1="100 * mark.y + '%'"
                       :x2="labelsStart" :y2="mark.top + line / 2"></line>
               </svg>
-              <ol class="oc-marks" :class="{ 'oc-fractions': hasFractions }" :style="{ ...(left === 'scene' ? clip : {}), fontSize: 0.75 * line + 'px', lineHeight: line + 'px' }">
-                <li class="oc-marks-head"><template v-for="head in marks_head"><span>{{ head }}</span>{{ " " }}</template></li>
+              <ol class="oc-marks" :class="{ 'oc-fractions': hasFractions, 'oc-narrow': isNarrow }" :style="{ ...(left === 'scene' ? clip : {}), fontSize: 0.75 * line + 'px', lineHeight: line + 'px' }">
+                <li class="oc-marks-head"><template v-for="head in columns(marks_head)"><span>{{ head }}</span>{{ " " }}</template></li>
                 <li v-for="mark in labels" :style="{ top: mark.top + 'px' }"
                     :class="{ 'oc-read': readers(mark, eye, left).length }"
                     ><b v-if="left !== 'scene'">{{ readers(mark, eye, left).map(label).join(" ") + " " }}</b
-                    ><template v-for="text in mark.texts"><span>{{ text }}</span>{{ " " }}</template></li>
+                    ><template v-for="text in columns(mark.texts)"><span>{{ text }}</span>{{ " " }}</template></li>
               </ol>
             </template>
-            <span class="oc-tag oc-tag-left" :style="{ opacity: shownSplit > 12 ? 1 : 0 }">
-              {{ left === "scene" || held === "scene" ? "Scene" : label(left) }}</span>
-            <span class="oc-tag oc-tag-right" :style="{ opacity: shownSplit < 88 ? 1 : 0 }">
+            <span class="oc-tag oc-tag-left" :style="{ opacity: whole || shownSplit > 12 ? 1 : 0 }">
+              {{ held === "scene" ? "Scene" : whole ? label(eye) : left === "scene" ? "Scene" : label(left) }}</span>
+            <span v-if="!whole" class="oc-tag oc-tag-right" :style="rightTag">
               {{ label(eye) }}</span>
             <span class="oc-state" :class="'oc-' + state(eye).kind" :key="state(eye).text">{{ state(eye).text }}</span>
             <span v-if="point && point.eye === eye" class="oc-cross"
                   :style="{ left: 100 * point.x + '%', top: 100 * point.y + '%' }"></span>
-            <div class="oc-split" :style="{ left: shownSplit + '%' }" role="slider" tabindex="0"
+            <div v-if="!whole" class="oc-split" :style="{ left: shownSplit + '%' }" role="slider" tabindex="0"
                  :aria-label="splitName(eye, left)"
                  aria-valuemin="0" aria-valuemax="100" :aria-valuenow="Math.round(split)"
                  :aria-valuetext="Math.round(split) + ' % ' + (left === 'scene' ? 'scene' : label(left))"
-                 @keydown="onKey"><i></i></div>
+                 @keydown="onKey"><i :style="{ top: knobTop }"></i></div>
           </div>
           <div v-if="!isEmpty" class="oc-captions">
             <template v-for="name in left === 'scene' ? [eye] : [left, eye]">
@@ -59,6 +60,7 @@ export default {
           </div>
         </div>
       </div>
+      <slot name="told"></slot>
       <div class="oc-view-tools">
         <button v-for="name in holdable" type="button" class="oc-tool" @pointerdown="hold(name)"
                 @pointerup="hold('')" @pointercancel="hold('')" @contextmenu.prevent
@@ -70,7 +72,7 @@ export default {
         <slot></slot>
       </div>
     </div>`,
-  props: { address: String, eyes: Array, labels_of: Object, behind_one: Boolean, aspect: Number,
+  props: { address: String, eyes: Array, labels_of: Object, behind_one: Boolean, whole: Boolean, aspect: Number,
     scene: String, alts: Object, marks: Array, marks_head: Array, captions: Object, empty: String },
   data() {
     return { hasScene: false, height: 0, width: 0, split: 50, held: "", dragging: false, point: null, states: {}, down: null };
@@ -87,11 +89,21 @@ export default {
       return this.behind_one ? [...this.eyes, "scene"] : ["scene"];
     },
     shownSplit() {
-      if (!this.held) return this.split;
+      if (!this.held) return this.whole ? 0 : this.split;
       return this.behind_one && this.held === this.eyes[1] ? 0 : 100;
     },
     clip() {
       return { clipPath: `inset(0 0 0 ${this.shownSplit}%)` };
+    },
+    rightTag() { // beside the split of a chart, whose right edge has the labels
+      const opacity = this.shownSplit < 88 ? 1 : 0;
+      if (!this.marks.length) return { opacity };
+      return { opacity, right: "auto", left: `calc(${this.shownSplit}% + 40px)` };
+    },
+    knobTop() { // between the first rows of a chart, unless one of them is marked
+      const [first, second] = this.marks;
+      if (!second || first.eyes.length || second.eyes.length) return "50%";
+      return `${50 * (first.y + second.y)}%`;
     },
     isEmpty() {
       return !this.hasScene || Boolean(this.empty);
@@ -102,9 +114,12 @@ export default {
     hasFractions() {
       return this.marks.some((mark) => mark.texts.at(-1).includes("/"));
     },
+    isNarrow() { // both notations would lie over the letters
+      const lettersEnd = Math.max(...this.marks.map((mark) => mark.x)) * this.width;
+      return this.marks_head.length > 1 && this.startOf(LABELS_EM) < lettersEnd;
+    },
     labelsStart() { // px from the left to the labels
-      const labels_em = LABELS_EM + (this.hasFractions ? FRACTION_EM : 0);
-      return Math.max(0, this.width - labels_em * 0.75 * this.line - 4);
+      return this.startOf(LABELS_EM - (this.isNarrow ? NARROW_EM : 0));
     },
     labels() {
       // beside their rows; moved up or down where rows are closer than lines
@@ -149,6 +164,13 @@ export default {
   methods: {
     label(eye) {
       return this.labels_of[eye] ?? "";
+    },
+    startOf(labels_em) {
+      const all_em = labels_em + (this.hasFractions ? FRACTION_EM : 0);
+      return Math.max(0, this.width - all_em * 0.75 * this.line - 4);
+    },
+    columns(texts) {
+      return this.isNarrow ? texts.slice(-1) : texts;
     },
     splitName(eye, left) {
       if (left !== "scene") return `Split between ${this.label(left)} and ${this.label(eye)}`;
@@ -240,7 +262,7 @@ export default {
       const { x } = this.position(event);
       const box = event.currentTarget.getBoundingClientRect();
       this.down = { x: event.clientX, y: event.clientY };
-      if (Math.abs(x - this.split / 100) * box.width < 22) {
+      if (!this.whole && Math.abs(x - this.split / 100) * box.width < 22) {
         this.dragging = true;
         event.currentTarget.setPointerCapture(event.pointerId);
         event.preventDefault();

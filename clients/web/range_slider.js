@@ -11,10 +11,10 @@ export default {
       <div v-if="text" class="oc-slider-head">
         <label :for="id">{{ label }}</label>
         <input v-if="typing" ref="typed" type="text" class="oc-typed" :aria-label="label + ', typed'"
-               :value="text" @keydown.enter="take" @keydown.esc="typing = false" @blur="take">
+               :value="text" @keydown.enter="take" @keydown.esc="leave" @blur="take">
         <template v-else>
           <span class="oc-value" aria-hidden="true">{{ text }}</span>
-          <button type="button" class="oc-type" :disabled="disabled" :aria-label="'Type ' + label"
+          <button type="button" ref="pencil" class="oc-type" :disabled="disabled" :aria-label="'Type ' + label"
                   @click="type">✎</button>
         </template>
       </div>
@@ -52,8 +52,17 @@ export default {
     },
     take(event) {
       if (!this.typing) return; // Enter also takes the focus away
+      const { value } = event.target;
+      if (event.type === "blur") this.typing = false;
+      else {
+        event.preventDefault(); // else Enter would press the button that gets the focus
+        this.leave();
+      }
+      if (value !== this.text) this.$emit("typed", value);
+    },
+    leave() { // by a key: the focus stays at this number
       this.typing = false;
-      if (event.target.value !== this.text) this.$emit("typed", event.target.value);
+      this.$nextTick(() => this.$refs.pencil?.focus());
     },
     onKey(event) {
       const steps = { PageUp: PAGE_STEPS, PageDown: -PAGE_STEPS }[event.key];

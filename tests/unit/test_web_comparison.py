@@ -228,14 +228,34 @@ def test_an_unknown_notation_is_refused():
         acuity_text(float("nan"), "feet")
 
 
+def test_a_night_road_sets_its_light_until_it_is_left():
+    state = PageState(picture=a_picture())
+    state.values[PUPIL.name] = 3.0
+    state.adapt_to("night_road")
+    assert state.light == "night"
+    assert state.values[PUPIL.name] == pupil_by_light_mm("night", 30.0) > 4.0
+    state.adapt_to("courtyard")
+    assert (state.light, state.values[PUPIL.name]) == (BY_HAND, 3.0)
+    state.keeps_focus = True  # a link or a scenario has its own pupil
+    state.adapt_to("night_road")
+    assert (state.light, state.values[PUPIL.name]) == (BY_HAND, 3.0)
+    state.keeps_focus = False
+    state.adapt_to("night_road")
+    state.move(PUPIL.name, 6.0)
+    state.adapt_to("stairs")
+    assert state.values[PUPIL.name] == 6.0  # set by hand
+
+
 def test_widths_are_compared_in_small_steps():
     sizes = sorted(WIDTHS_ARCMIN.values())
     ratios = np.divide(sizes[1:], sizes[:-1])
     assert sizes[0] <= 0.5
     assert sizes[-1] >= 1200.0
     assert ratios.max() <= 1.5
-    assert "stroke of a letter of the 0.5" in nearest_familiar_object(1.0)
-    assert "0.35" in nearest_familiar_object(8.8 / 2 * 1.5)
+    assert nearest_familiar_object(1.0) == "the stroke of a fine pen at arm's length"
+    assert nearest_familiar_object(7.75) == "half the full moon"
+    # a row of a chart would be read as an acuity
+    assert not any("line" in name or "letter" in name for name in WIDTHS_ARCMIN)
 
 
 def test_pictures_are_joined_beside_each_other():

@@ -1,6 +1,7 @@
 """States A and B of one person, scenarios, typed values, sizes of what is pressed."""
 
 import io
+import re
 
 import numpy as np
 import pytest
@@ -94,6 +95,12 @@ def test_states_are_exchanged_and_shown_side_by_side(page):
     page.page.wait_for_timeout(500)
     assert page.page.locator(".oc-view").count() == 2
     assert _detail(page.seen("OD")) < 0.8 * _detail(page.seen("OD_B"))
+    assert page.page.locator(".oc-split").count() == 0  # each is shown whole
+    for name, eye in (("A", "OD"), ("B", "OD_B")):
+        view = page.page.locator(f".oc-view[data-eye={eye}]")
+        assert view.locator(".oc-tag:visible").all_inner_texts() == [name]
+        clip = view.locator(".oc-after").evaluate("e => getComputedStyle(e).clipPath")
+        assert "100%" not in clip
     for figure in ("Acuity", "Contrast", "Field"):
         page.choose(figure)
         page.page.locator(f".oc-figure img[alt={figure}]").wait_for()
@@ -114,12 +121,65 @@ def test_a_scenario_sets_scene_conditions_and_states(page):
     captions.nth(1).wait_for()
     lines = [float(text.split()[-1]) for text in captions.all_inner_texts()]
     assert lines[1] > 2.0 * lines[0]  # decimal acuity with the addition
+    told = page.page.locator(".oc-sight")
+    told.get_by_text("Blurred at 40 cm").wait_for()
+    assert re.search(r"B: Sharp at 40 cm: predicted acuity 1\.\d\d", told.inner_text())
+    assert page.page.locator(".oc-tag:visible").all_inner_texts() == ["A", "B"]
     page.pick(".oc-notation", "20/20")
     page.page.locator(".oc-marks-head").get_by_text("feet").wait_for()
     cut_off = """() => [...document.querySelectorAll('.oc-marks span')]
       .filter(text => text.scrollWidth > text.clientWidth + 1)
       .map(text => text.innerText)"""
     assert page.page.evaluate(cut_off) == []
+
+
+def test_nothing_is_said_of_the_eye_before(page):
+    told = page.page.locator(".oc-sight")
+    told.get_by_text("Sharp at").wait_for()
+    points = page.page.locator(".oc-psf .oc-outdated")
+    points.first.wait_for(state="detached")
+    words = """() => {
+      const sight = document.querySelector('.oc-sight');
+      const point = document.querySelector('.oc-psf [class*=html]') ?? sight;
+      window.words = [];
+      new MutationObserver(() => window.words.push([
+        sight.innerText, document.querySelectorAll('.oc-psf .oc-outdated').length]))
+        .observe(document.querySelector('main'),
+          { subtree: true, childList: true, characterData: true, attributes: true });
+    }"""
+    page.page.evaluate(words)
+    page.entry("sphere_dpt").fill("-4")
+    told.get_by_text("Blurred at").wait_for()
+    points.first.wait_for(state="detached")
+    shown = page.page.evaluate("window.words")
+    sentences = [text for text, _ in shown]
+    assert "" in sentences  # nothing, until it is known
+    gone = sentences.index("")
+    assert not any("Sharp" in text for text in sentences[gone:])
+    assert any(outdated for _, outdated in shown[gone:])
+
+
+def test_a_night_road_sets_the_pupil_and_offers_straylight(page):
+    number = page.number()
+    page.choose("Night road")
+    told = page.settle(after=number)
+    assert told["pupil_diameter_mm"] > 5.0
+    number = page.number()
+    page.choose("Add straylight of this age")
+    page.settle(after=number)
+    offer = page.page.get_by_role("button", name="Add straylight of this age")
+    assert not offer.is_visible()
+    page.page.locator(".oc-haze").get_by_text("of the light is scattered").wait_for()
+
+
+def test_the_focus_stays_at_a_number_that_was_typed(page):
+    page.page.get_by_role("button", name="Type Pupil").click()
+    page.page.keyboard.press("Control+a")
+    page.page.keyboard.type("5 mm")
+    page.page.keyboard.press("Enter")
+    page.page.wait_for_timeout(200)
+    focused = page.page.evaluate("document.activeElement.ariaLabel")
+    assert focused == "Type Pupil"
 
 
 def test_a_distance_is_typed_and_chosen_as_people_say_it(page):

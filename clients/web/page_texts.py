@@ -1,0 +1,27 @@
+"""Explanations on the page."""
+
+PICTURE_HELP = (
+    "Left of the divider is the scene, right of it what the eye sees; in a comparison, "
+    "A and B. Drag the divider, or hold a button to see one of them alone. A click "
+    "focuses the eye on what is there. The picture is sharpest in the direction of the "
+    "gaze, the center: objects at the side are blurred, as in every eye."
+)
+CONDITIONS_HELP = (
+    "They hold for all pictures. “Light” sets the pupil by the luminance of the "
+    "surroundings and the age (Watson and Yellott 2012). The focus is the "
+    "distance that the eye looks at; “Distance” is that of the letter chart or of a "
+    "photograph without depth. The pencil beside a slider takes a typed value, such as "
+    "6 m, 40 cm, 20 ft or 2.5 dpt."
+)
+HAZE_OFFER = (
+    "At night, light that scatters in the eye lies as a veil around lamps; these "
+    "entries leave it out."
+)
+NORMAL = (
+    "Every eye is sharp only where it looks: what is at the side is blurred, and dark "
+    "edges have colored fringes. People do not notice either in their own sight."
+)
+NOT_MEDICAL = (
+    "Not a medical device: for demonstration and research. It models the optics of an "
+    "eye, not its health, and does not replace an examination."
+)
