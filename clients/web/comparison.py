@@ -12,7 +12,16 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from clients.web.controls import AGE, CONDITIONS, CORRECTION, PRESCRIPTION, NumberField
+from clients.web.controls import (
+    AGE,
+    AXIS,
+    CONDITIONS,
+    CORRECTION,
+    CYLINDER,
+    PRESCRIPTION,
+    SPHERE,
+    NumberField,
+)
 from clients.web.eye_form import (
     DESIGNS,
     HAZES,
@@ -132,10 +141,25 @@ def _correction_text(flat: Mapping[str, Any]) -> str:
     if kind == "iol":
         design = flat.get("correction.design", "monofocal")
         parts.append(DESIGNS.get(design, design).lower())
-    sphere_dpt = flat.get("correction.sphere_dpt")
-    if sphere_dpt:
-        parts.append(_text("correction.sphere_dpt", flat))
+    powers = _powers_text(flat, CORRECTION_PREFIX)
+    residual = _powers_text(flat, f"{CORRECTION_PREFIX}residual_")
+    parts += [powers] if powers else []
+    parts += [f"residual {residual}"] if residual else []
+    if flat.get("correction.add_dpt") and kind == "progressive":
+        parts.append(f"addition {_text('correction.add_dpt', flat)}")
     return ", ".join(parts)
+
+
+def _powers_text(flat: Mapping[str, Any], prefix: str) -> str:
+    """Return sphere, cylinder and axis as people write them; empty without power."""
+    sphere_dpt, cylinder_dpt, axis_deg = (
+        flat.get(f"{prefix}{name}") or 0.0
+        for name in ("sphere_dpt", "cylinder_dpt", "axis_deg")
+    )
+    if not cylinder_dpt:
+        return SPHERE.describe(sphere_dpt) if sphere_dpt else ""
+    powers = f"{SPHERE.show(sphere_dpt)} {CYLINDER.show(cylinder_dpt)}"
+    return f"{powers} x {AXIS.describe(axis_deg)}"
 
 
 def _label(path: str) -> str:
@@ -193,9 +217,18 @@ def label_of(name: EyeName, body: Mapping[str, Any]) -> str:
     parts = [f"{title_of(name, is_comparing=True)}: {SIDES[side_of(name)].lower()}"]
     if "name" in flat and flat.get("kind") == "preset":
         parts.append(_text("name", flat))
-    if flat.get("sphere_dpt"):
-        parts.append(_text("sphere_dpt", flat))
+    parts.append(_powers_text(flat, ""))
     parts.append(f"correction: {_correction_text(flat)}")
     if AGE.name in flat:
         parts.append(_text(AGE.name, flat))
-    return ", ".join(parts)
+    return ", ".join(filter(None, parts))
+
+
+def short_label_of(name: EyeName, body: Mapping[str, Any]) -> str:
+    """Return the letter of a state and its lens, for the headings of a report."""
+    kind = _flat(body).get("correction.kind")
+    design = (body.get("correction") or {}).get("design", "monofocal")
+    lens = KINDS.get(kind, kind).lower() if kind else "no correction"
+    if kind == "iol":
+        lens = f"{DESIGNS.get(design, design).lower()} implant"
+    return f"{title_of(name, is_comparing=True)} ({lens})"

@@ -11,7 +11,15 @@ import re
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
-from clients.web.written import DEGREE, MINUS_SIGNS, written_number
+from clients.web.written import (
+    DEGREE,
+    DIOPTERS,
+    MINUS_SIGNS,
+    NO_CYLINDER,
+    prescription_hint,
+    written_number,
+)
+from clients.web.written import begins_prescription as begins_prescription
 from clients.web.written import prescription_texts as prescription_texts
 from estimator.dynamics import steady_pupil_mm
 
@@ -76,11 +84,15 @@ class NumberField:
         shown = text.strip()
         if not shown:
             raise ValueError(f"{self.label} is empty; allowed: {self.allowed}")
+        if self.name.endswith("cylinder_dpt") and shown.lower() in NO_CYLINDER:
+            return 0.0
         value = written_number(
             shown, unit=self.unit, is_vertex=self.name == "vertex_mm"
         )
         if not math.isfinite(value):
-            raise ValueError(f"“{shown:.20}” is not a number; allowed: {self.allowed}")
+            hint = prescription_hint(shown) if self.unit == DIOPTERS else ""
+            text = hint or f"is not a number; allowed: {self.allowed}"
+            raise ValueError(f"“{shown:.20}” {text}")
         if not self.low <= value <= self.high:
             raise ValueError(f"{shown:.20} is out of range; allowed: {self.allowed}")
         return value

@@ -14,7 +14,6 @@ HINTS: dict[WornKind, str] = {
     "gaze sliders to look through other parts of the lens.",
     "lenslets": "396 lenslets around a clear center; use the gaze sliders to look "
     "through other parts.",
-    "contact_lens": "Spherical aberration is what the lens adds: C(4,0) through 6 mm.",
     "iol": "Length and cornea of the eye above stay.",
     "laser": "Everything but the cornea of the eye above stays.",
 }
@@ -29,7 +28,13 @@ RESIDUAL = (
     "sharp far away. Through other pupils, spherical aberration changes it: through "
     "3 mm, by some +0.2 dpt without a compensating lens."
 )
+HELP_SUBJECTS: dict[WornKind, str] = {
+    "contact_lens": "contact lens",
+    "iol": "surgery",
+    "laser": "surgery",
+}
 HELP: dict[WornKind, str] = {
+    "contact_lens": "Spherical aberration is what the lens adds: C(4,0) through 6 mm.",
     "iol": "An implant replaces the natural lens. Its power is chosen for the "
     f"refraction that remains. {RESIDUAL} Accommodation, and haze and yellowing of the "
     "natural lens, are gone. " + SPHERICAL.format("lens adds"),

@@ -19,9 +19,15 @@ from clients.web.controls import (
     SPHERE_SLIDER,
     STRAYLIGHT,
     NumberField,
+    begins_prescription,
     prescription_texts,
 )
-from clients.web.correction_hints import HELP, additions_text, correction_hint
+from clients.web.correction_hints import (
+    HELP,
+    HELP_SUBJECTS,
+    additions_text,
+    correction_hint,
+)
 from clients.web.eye_form import (
     CATARACT,
     DESIGNS,
@@ -35,7 +41,9 @@ from clients.web.eye_form import (
 from clients.web.widgets import (
     SliderRow,
     help_button,
+    more,
     select,
+    small_button,
     switch,
     title,
     toggle,
@@ -169,11 +177,12 @@ class EyePanel:
             for number in PRESCRIPTION[1:]:
                 self._entry(number, form.texts)
         if form.applies_higher_order:
-            self._choices["higher_order"] = self._switch(
-                "Higher-order aberrations of this age",
-                "has_higher_order",
-                rebuilds=False,
-            )
+            with more(is_open=not form.has_higher_order):
+                self._choices["higher_order"] = self._switch(
+                    "Higher-order aberrations of this age",
+                    "has_higher_order",
+                    rebuilds=False,
+                )
         else:
             ui.label(NO_HIGHER_ORDER).classes("oc-hint")
 
@@ -181,24 +190,36 @@ class EyePanel:
         self, number: NumberField, texts: dict[str, str], *, is_worn: bool = False
     ) -> ui.input:
         """Return an entry for one number, with validation."""
-        is_pasted = False
+        is_pasted = is_left = False
+
+        def problem(text: str | None) -> str | None:
+            """Return the error in a text; none while a prescription is typed."""
+            found = number.problem(text or "")
+            is_typing = number is SPHERE and not is_left
+            return None if is_typing and begins_prescription(text or "") else found
 
         def store(event: events.ValueChangeEventArguments) -> None:
-            nonlocal is_pasted
+            nonlocal is_pasted, is_left
+            is_left = False
             texts[number.name] = event.value or ""
             if is_pasted and number is SPHERE and prescription_texts(event.value or ""):
                 # nicegui sends no value for an entry while it handles the entry's event
                 asyncio.get_running_loop().call_soon(normalize)
-            else:
+            elif problem(event.value) == number.problem(event.value or ""):
                 self._on_change()  # an invalid entry is reported
             is_pasted = False
 
         def normalize() -> None:
             """Show the text as usual; a whole prescription fills its three entries."""
+            nonlocal is_left
             text = entry.value or ""
             found = prescription_texts(text) if number is SPHERE else None
             if found is None:
                 entry.set_value(number.normalized(text))
+                if not is_left and number.problem(text):
+                    is_left = True
+                    entry.validate()
+                    self._on_change()
                 return
             for each, part in zip((SPHERE, CYLINDER, AXIS), found, strict=True):
                 self._entries[each.name, is_worn].set_value(each.normalized(part))
@@ -210,7 +231,7 @@ class EyePanel:
         entry = ui.input(
             number.label.removeprefix(RESIDUAL_PREFIX).capitalize(),
             value=texts[number.name],
-            validation=lambda text: number.problem(text or ""),
+            validation=problem,
             on_change=store,
         )
         entry.props(
@@ -220,6 +241,7 @@ class EyePanel:
         entry.props["data-name"] = number.name
         self._entries[number.name, is_worn] = entry
         entry.on("blur", normalize)
+        entry.on("keyup.enter", normalize)  # after the browser's own change event
         entry.on("paste", paste)
         for key, steps in (("up", 1), ("down", -1)):
             entry.on(
@@ -280,9 +302,9 @@ class EyePanel:
             )
             can_correct = not form.wears_correction or worn.kind in DISTANCE_KINDS
             if form.source == "prescription" and can_correct:
-                ui.button("Correct fully", on_click=self._correct_fully).props(
-                    "flat dense no-caps size=sm"
-                ).tooltip("Wear the prescription above; keep kind of lens and addition")
+                small_button("Correct fully", self._correct_fully).tooltip(
+                    "Wear the prescription above; keep kind of lens and addition"
+                )
         if not form.wears_correction:
             return
         with ui.element("div").classes("oc-line"):
@@ -290,7 +312,7 @@ class EyePanel:
                 worn.kinds, worn.kind, self._takes(form.choose_worn), label="Correction"
             ).classes("oc-grow oc-worn-kind")
             if worn.kind in HELP:
-                help_button("surgery", HELP[worn.kind])
+                help_button(HELP_SUBJECTS[worn.kind], HELP[worn.kind])
         if worn.kind == "iol":
             self._choices["correction.design"] = select(
                 DESIGNS,

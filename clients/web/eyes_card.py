@@ -26,6 +26,10 @@ from clients.web.widgets import (
 SHOWN = {"OD": "Right eye", "OS": "Left eye", "both": "Both"}
 EDITED = {"A": "A", "B": "B"}
 
+COMPARED = (
+    "B started as a copy of A: change what differs, which is marked in orange. “B = A” "
+    "copies A again."
+)
 EYE_HELP = (
     "Describe the eye by its prescription, a preset or a file. A normal eye of 30 "
     "years is not perfect: it blurs toward the side and has slight aberrations and "
@@ -89,6 +93,7 @@ class EyesCard:
                 props="spread",
                 kind="oc-edited",
             )
+            self._explained = ui.label(COMPARED).classes("oc-hint oc-compared")
             self._add_slider = add_slider
             self._ages = {AGE: add_slider(AGE)}
             self._age_b = ui.element("div")
@@ -164,7 +169,7 @@ class EyesCard:
         for name, panel in self._panels.items():
             panel.box.set_visibility(name in edited)
             panel.heading.set_visibility(state.shown == "both")
-        for element in (self._tools, self._edited):
+        for element in (self._tools, self._edited, self._explained):
             element.set_visibility(state.is_comparing)
         for number, row in self._ages.items():
             row.set_visibility(state.age(edited[0]) is number)

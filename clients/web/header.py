@@ -13,7 +13,13 @@ from clients.headset.runtime import Eye
 from clients.openxr_layer.wire import ask as ask_helper
 from clients.openxr_layer.wire import socket_path
 from clients.report import report_html
-from clients.web.comparison import EyeName, joined_png, label_of, side_of
+from clients.web.comparison import (
+    EyeName,
+    joined_png,
+    label_of,
+    short_label_of,
+    side_of,
+)
 from clients.web.eye_form import SIDES, EyeSide
 from clients.web.figure_worker import Ask, FigureFailed
 from clients.web.page_state import PageState, fragment_of
@@ -34,6 +40,11 @@ window.addEventListener("hashchange",
   () => emitEvent("oc-fragment", location.hash.slice(1)));
 return location.hash.slice(1);
 """
+SKIP = """() => {
+  const part = document.querySelector("%s");
+  part.scrollIntoView();
+  part.querySelector("button, input, [tabindex='0']").focus();
+}"""
 COPY = """
 const link = location.origin + "/?token=" + TOKEN + location.hash;
 if (navigator.clipboard) navigator.clipboard.writeText(link);
@@ -46,6 +57,10 @@ else {  // no clipboard API over HTTP from another machine
 }
 """
 
+
+REPORT_TIP = (
+    "Report on this eye, HTML: open it in a browser and print it, or save it as PDF"
+)
 
 Action = Callable[[], Awaitable[None]]
 
@@ -90,6 +105,10 @@ class Header:
         self._fragment: str | None = None  # not read yet
         self._update = Delayed(UPDATE_DELAY_S)
         with ui.element("header").classes("oc-header"):
+            for label, css in (("picture", ".oc-picture"), ("entries", ".oc-eyes")):
+                with ui.element("button").classes("oc-skip") as skip:
+                    skip.props("type=button").on("click", js_handler=SKIP % css)
+                    ui.label(f"Skip to the {label}")
             title("ocufilter", "h1", "oc-brand")
             ui.label("See through another person’s eyes").classes("oc-motto")
             ui.label("Not a medical device").classes("oc-hint oc-not-medical")
@@ -99,7 +118,7 @@ class Header:
         buttons: list[tuple[str, str, str, Action]] = [
             ("Picture", "download", "The image that the eye sees, PNG", self._picture),
             ("Profile", "download", "The eye's profile, JSON", self._profile),
-            ("Report", "download", "Report on this eye, HTML", self._report),
+            ("Report", "download", REPORT_TIP, self._report),
             (
                 *("Copy link", "link"),
                 "Link to these entries, including the access token",
@@ -155,8 +174,8 @@ class Header:
                 f"{SIDES[state.sides[0]].lower()}, A and B",
                 f"{state.sides[0]}_A_B",
                 *(before, after),
-                label="A",
-                after_label="B",
+                label=short_label_of(state.names[0], before),
+                after_label=short_label_of(state.names[1], after),
             )
             return
         for name, body in known.items():

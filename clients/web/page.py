@@ -53,6 +53,7 @@ from clients.web.widgets import (
     SliderRow,
     card,
     help_button,
+    more,
     problem_label,
     select,
     small_button,
@@ -225,11 +226,12 @@ class Page:
                     for label, meters in DISTANCES_M.items():
                         small_button(label, partial(self._set_distance, meters))
                 ui.element("span").classes("oc-grow")
-                self._pipelines = toggle(
-                    *(PIPELINES, self.state.pipeline, self._choose_pipeline),
-                    label="Method",
-                    props="size=sm",
-                )
+                with more():
+                    self._pipelines = toggle(
+                        *(PIPELINES, self.state.pipeline, self._choose_pipeline),
+                        label="Method",
+                        props="size=sm",
+                    )
                 help_button("viewing conditions", CONDITIONS_HELP)
 
     def _slider(self, number: NumberField) -> SliderRow:

@@ -76,6 +76,15 @@ def help_button(subject: str, text: str) -> ui.button:
     return button
 
 
+def more(label: str = "More", *, is_open: bool = False) -> ui.element:
+    """Return a part that is folded until its label is pressed; use it as a context."""
+    part = ui.element("details").classes("oc-more")
+    part.props("open" if is_open else "")
+    with part, ui.element("summary"):
+        ui.label(label)
+    return part
+
+
 def problem_label() -> ui.label:
     """Return a label for errors, which screen readers announce."""
     return ui.label("").classes("oc-problem").props("role=alert")

@@ -33,6 +33,12 @@ _PRESCRIPTION = re.compile(
     r"(?:[x×*@/;]|ax(?:is|e)?\.?|\s)\s*(\d{1,3})\s*(?:°|deg)?",
     _FLAGS,
 )
+_START = re.compile(rf"{_ENTRY}\s*(?:[/;]|\s|[+-]).*", _FLAGS)
+_AXIS = r"\s*(?:[x×*@]|ax(?:is|e)?\.?)\s*(\d{1,3})\s*(?:°|deg)?"
+_ONE_POWER = re.compile(_ENTRY + _AXIS, _FLAGS)
+NO_CYLINDER = ("ds", "sph", "sphere")
+"""Texts in place of a cylinder of 0."""
+
 _SPHERE_ALONE = re.compile(rf"({_NUMBER}|{_PLANO})\s*(?:ds|sph|sphere)\b\.?", _FLAGS)
 
 
@@ -113,6 +119,26 @@ def prescription_texts(text: str) -> tuple[str, str, str] | None:
     if found is None:
         return None
     return _digits(found[1]), _digits(found[2]), found[3]
+
+
+def begins_prescription(text: str) -> bool:
+    """Return whether a text may become a whole prescription as it is typed on."""
+    plain = text.strip().translate(MINUS_SIGNS)
+    is_other = _PRISM.search(plain) or _ADDITION.search(plain)
+    return is_other is None and (
+        _START.fullmatch(plain) is not None or prescription_texts(text) is not None
+    )
+
+
+def prescription_hint(text: str) -> str:
+    """Return what a text lacks that has an axis but one power; empty otherwise."""
+    found = _ONE_POWER.fullmatch(text.strip().translate(MINUS_SIGNS))
+    if found is None:
+        return ""
+    return (
+        "has an axis but one power: write sphere, cylinder and axis, as "
+        f"“plano {found[1]} x {found[2]}”"
+    )
 
 
 def _digits(power: str) -> str:

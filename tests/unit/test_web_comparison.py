@@ -12,7 +12,7 @@ from PIL import Image
 from clients.acuity_text import acuity_text
 from clients.scenarios import scenarios
 from clients.web.blur_widths import WIDTHS_ARCMIN, nearest_familiar_object
-from clients.web.comparison import differences, joined_png
+from clients.web.comparison import differences, joined_png, short_label_of
 from clients.web.controls import (
     AGE,
     AGE_B,
@@ -226,6 +226,20 @@ def test_an_unknown_notation_is_refused():
         acuity_text(0.0, "jaeger")
     with pytest.raises(ValueError, match="log_mar is nan"):
         acuity_text(float("nan"), "feet")
+
+
+def test_the_whole_prescription_of_a_correction_is_named():
+    a = {"kind": "prescription", "sphere_dpt": -3.5, "cylinder_dpt": -1.25}
+    lens = {"sphere_dpt": -3.5, "cylinder_dpt": -1.25, "axis_deg": 80.0}
+    (one,) = differences(a, a | {"correction": lens})
+    assert (one.a, one.b) == ("none", "Spectacles, -3.50 -1.25 x 80°")
+    implant = {"kind": "iol", "design": "trifocal", "residual_cylinder_dpt": -0.5}
+    implant |= {"residual_axis_deg": 10.0}
+    (one,) = differences(a | {"correction": lens}, a | {"correction": implant})
+    assert one.b == "Intraocular lens, trifocal, residual 0.00 -0.50 x 10°"
+    assert short_label_of("OD_B", a | {"correction": implant}) == "B (trifocal implant)"
+    assert short_label_of("OD", a | {"correction": lens}) == "A (spectacles)"
+    assert short_label_of("OS", a) == "A (no correction)"
 
 
 def test_a_night_road_sets_its_light_until_it_is_left():

@@ -2,7 +2,14 @@
 
 import pytest
 
-from clients.web.controls import AXIS, CYLINDER, SPHERE, VERTEX, prescription_texts
+from clients.web.controls import (
+    AXIS,
+    CYLINDER,
+    SPHERE,
+    VERTEX,
+    begins_prescription,
+    prescription_texts,
+)
 
 
 @pytest.mark.parametrize(
@@ -19,6 +26,8 @@ from clients.web.controls import AXIS, CYLINDER, SPHERE, VERTEX, prescription_te
         (SPHERE, "-.75 sph", -0.75),
         (CYLINDER, "-0.75DC", -0.75),
         (CYLINDER, "-1.25 cyl", -1.25),
+        (CYLINDER, "DS", 0.0),
+        (CYLINDER, "sph", 0.0),
         (AXIS, "x80", 80.0),
         (AXIS, "@ 175°", 175.0),
         (AXIS, "ax 5", 5.0),
@@ -45,6 +54,12 @@ def test_an_entry_is_understood(field, text, value):
         (SPHERE, "-1.00 3 PD", "contains a prism"),
         (SPHERE, "-1.00 add +2.00", "contains an addition: enter it with progressive"),
         (SPHERE, "-1.00 -0.50", "is not a number"),
+        (
+            SPHERE,
+            "+1.00 @ 90",
+            "write sphere, cylinder and axis, as “plano +1.00 x 90”",
+        ),
+        (SPHERE, "DS", "is not a number"),
         (SPHERE, "platinum", "is not a number"),
         (SPHERE, "-31 DS", "-31 DS is out of range; allowed: −30 to 30 dpt"),
         (AXIS, "x 181", "x 181 is out of range; allowed: 0 to 180°"),
@@ -70,6 +85,24 @@ def test_what_is_not_understood_is_said(field, text, said):
 )
 def test_a_whole_prescription_fills_three_entries(text, parts):
     assert prescription_texts(text) == parts
+
+
+@pytest.mark.parametrize(
+    ("text", "is_start"),
+    [
+        ("-3.50 -", True),
+        ("-3.50 -1.25", True),
+        ("-3.50 -1.25 x", True),
+        ("-3.50 -1.25 x 80", True),
+        ("plano -0.7", True),
+        ("-3.50", False),
+        ("abc", False),
+        ("-2.00 2 BO", False),
+        ("-1.00 add +2.00", False),
+    ],
+)
+def test_a_prescription_is_known_before_it_is_complete(text, is_start):
+    assert begins_prescription(text) == is_start
 
 
 @pytest.mark.parametrize("text", ["-2.50", "plano", "abc", "-2.5 -1 x", "x 80"])

@@ -126,6 +126,27 @@ def test_a_profile_of_the_left_eye_is_loaded_there(page):
     assert left.locator("input[data-name=sphere_dpt]").input_value() == "-4.00"
 
 
+def test_a_typed_prescription_is_taken_by_enter(page):
+    number = page.number()
+    entry = page.entry("sphere_dpt")
+    entry.fill("")
+    entry.press_sequentially("-3.5 -1.25", delay=30)
+    page.page.wait_for_timeout(900)  # a pause in the middle
+    assert page.page.locator(".oc-entry.q-field--error").count() == 0
+    assert page.page.locator(".oc-problem:visible").count() == 0
+    entry.press_sequentially(" x 80", delay=30)
+    entry.press("Enter")
+    page.settle(after=number)
+    page.page.wait_for_function(
+        "['sphere_dpt', 'cylinder_dpt', 'axis_deg'].map(name => "
+        "document.querySelector(`input[data-name=${name}]`).value).join(' ')"
+        " === '-3.50 -1.25 80'"
+    )
+    page.entry("sphere_dpt").fill("-3.5 -1.25")
+    page.entry("sphere_dpt").press("Enter")
+    page.page.get_by_text("“-3.5 -1.25” is not a number").first.wait_for()
+
+
 def test_a_pasted_prescription_fills_its_entries(page):
     page.page.context.grant_permissions(["clipboard-read", "clipboard-write"])
     page.page.evaluate("navigator.clipboard.writeText('-3.5 -1.25 x 80')")
