@@ -278,6 +278,7 @@ def draw_field_map(
     title: str,
     label: str,
     middle: float | None = None,
+    compared: Sequence[NDArray[np.float64]] = (),
 ) -> None:
     """Draw a map of values (n,) of the field's directions.
 
@@ -285,16 +286,21 @@ def draw_field_map(
     ----------
     middle : float, optional
         Value at which the diverging colors are white; sequential colors if None.
+    compared : sequence of (n,)
+        Values of all maps that have the same colors, with these ones.
     """
+    of_all = np.concatenate([values, *compared])
     grid = values.reshape(FIELD_V_DEG.size, FIELD_H_DEG.size)
     levels: int | NDArray[np.float64]
     levels, colors = LEVEL_COUNT, SEQUENTIAL
     if middle is not None:
-        reach = max(float(np.abs(grid - middle).max()), MIN_RANGE_DPT)
+        reach = max(float(np.abs(of_all - middle).max()), MIN_RANGE_DPT)
         levels = np.linspace(middle - reach, middle + reach, LEVEL_COUNT + 1)
         colors = DIVERGING
-    elif np.ptp(grid) < 1e-6:
+    elif np.ptp(of_all) < 1e-6:
         levels = np.linspace(grid.min() - 0.5, grid.min() + 0.5, LEVEL_COUNT + 1)
+    elif compared:
+        levels = np.linspace(of_all.min(), of_all.max(), LEVEL_COUNT + 1)
     drawn = axes.contourf(FIELD_H_DEG, FIELD_V_DEG, grid, levels=levels, cmap=colors)
     axes.plot(0.0, 0.0, "+", color="k", markersize=5, markeredgewidth=0.7)
     axes.set_aspect("equal")
@@ -302,20 +308,37 @@ def draw_field_map(
     color_bar(axes, drawn, label=label)
 
 
-def draw_field_maps(panel: FigureBase, study: EyeStudy) -> None:
-    """Draw M, J0, J45 and blur over 60 x 40 deg, from the person's view."""
-    m_dpt, j0_dpt, j45_dpt = study.field.power_dpt.T
+def draw_field_maps(
+    panel: FigureBase, study: EyeStudy, *, compared: Sequence[EyeStudy] = ()
+) -> None:
+    """Draw M, J0, J45 and blur over 60 x 40 deg, from the person's view.
+
+    Parameters
+    ----------
+    compared : sequence of EyeStudy
+        Eyes whose maps have the same colors, with this one.
+    """
+    studies = (study, *compared)
+    powers_dpt = [each.field.power_dpt.T for each in studies]
+    m_dpt = [power[0] for power in powers_dpt]
+    middle_dpt = float(np.mean([m[m.size // 2] for m in m_dpt[-len(compared) :]]))
     maps = {
-        "M": (m_dpt, "dpt", float(m_dpt[m_dpt.size // 2])),
-        "J0": (j0_dpt, "dpt", 0.0),
-        "J45": (j45_dpt, "dpt", 0.0),
-        "Blur, focused far": (blur_arcmin(study), "arcmin, RMS", None),
+        "M": (m_dpt, "dpt", middle_dpt),
+        "J0": ([power[1] for power in powers_dpt], "dpt", 0.0),
+        "J45": ([power[2] for power in powers_dpt], "dpt", 0.0),
+        "Blur, focused far": (
+            [blur_arcmin(each) for each in studies],
+            "arcmin, RMS",
+            None,
+        ),
     }
     grid = panel.subplots(2, 2, sharex=True, sharey=True)
     for axes, (name, (values, label, middle)) in zip(
         grid.ravel(), maps.items(), strict=True
     ):
-        draw_field_map(axes, values, title=name, label=label, middle=middle)
+        draw_field_map(
+            axes, values[0], title=name, label=label, middle=middle, compared=values[1:]
+        )
     sides = ("nasal", "temporal")
     left, right = sides if study.profile.eye_side == "OD" else sides[::-1]
     panel.supxlabel(

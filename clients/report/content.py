@@ -47,11 +47,13 @@ from clients.report.html_page import (
     Table,
     Text,
 )
+from clients.report.plain import plain_text
 from clients.report.tables import (
     NOTATION_WORDS,
     REFRACTION_ROWS,
     VISION_ROWS,
     acuity_text,
+    biometry_table,
     change_text,
     coefficient_table,
     field_table_block,
@@ -60,6 +62,7 @@ from clients.report.tables import (
     refraction_table,
     refraction_text,
     spectacles_text,
+    vision_cell,
     vision_note,
     vision_table,
 )
@@ -210,7 +213,8 @@ def legend(study: EyeStudy, notation: Notation = "decimal") -> str:
         + ". “Best corrected”: with the sphere and cylinder of the highest visual "
         "Strehl ratio through that pupil, and an acuity not below “as it is”. Charts: "
         "the eye tries to focus on each; rows in "
-        f"{NOTATION_WORDS[notation]}, ◂ the smallest read."
+        f"{NOTATION_WORDS[notation]}, ◂ the smallest read; the rows below it are shown "
+        "but not read."
     )
 
 
@@ -271,11 +275,17 @@ def _row_text(log_mar: float, notation: Notation) -> str:
     return " · ".join(acuity_in(log_mar, each) for each in dict.fromkeys(notations))
 
 
-def field_row(facts: EyeFacts, *, name: str = "", height_mm: float = FIELD_MM) -> Row:
-    """Return the visual field of an eye as maps and as a table."""
+def field_row(
+    facts: EyeFacts,
+    *,
+    name: str = "",
+    height_mm: float = FIELD_MM,
+    compared: tuple[EyeStudy, ...] = (),
+) -> Row:
+    """Return the field of an eye as maps, in the colors of `compared`, and a table."""
     study = facts.study
     maps = Plot(
-        lambda panel: draw_field_maps(panel, study),
+        lambda panel: draw_field_maps(panel, study, compared=compared),
         height_mm,
         "Maps of M, J0, J45 and blur over 60 by 40 degrees",
     )
@@ -361,7 +371,7 @@ def _difference(before: EyeFacts, after: EyeFacts) -> Section:
     pairs = list(zip(studies, labels, strict=True))
     tables = [_refraction_table(before, after), _vision_table(before, after)]
     if all("biometry" in facts.numbers["eye"] for facts in (before, after)):
-        tables.append(_biometry_table(before, after))
+        tables.append(biometry_table((before, after), _moments(before, after)))
     bars = on_axes(
         lambda axes: draw_rms_by_order(axes, studies, labels=labels),
         PAIR_MAP_MM,
@@ -372,6 +382,7 @@ def _difference(before: EyeFacts, after: EyeFacts) -> Section:
         if _moments(before, after) == ("before", "after")
         else "Both eyes of this report",
         (
+            Row((Text((plain_text(before, after),)),)),
             *(Row((table,)) for table in tables),
             Row((*(_map(*pair, studies) for pair in pairs), bars)),
             Row(tuple(_psfs(*pair, psf_sides_arcmin(studies)) for pair in pairs)),
@@ -408,7 +419,12 @@ def _field(before: EyeFacts, after: EyeFacts) -> Section:
         "Over the visual field, and section of the eye",
         (
             *(
-                field_row(facts, name=moment, height_mm=PAIR_FIELD_MM)
+                field_row(
+                    facts,
+                    name=moment,
+                    height_mm=PAIR_FIELD_MM,
+                    compared=(before.study, after.study),
+                )
                 for facts, moment in zip(both, _moments(before, after), strict=True)
             ),
             Row(tuple(section_plot(f.study, height_mm=PAIR_SECTION_MM) for f in both)),
@@ -503,32 +519,6 @@ def _refraction_table(before: EyeFacts, after: EyeFacts) -> Table:
     )
 
 
-BIOMETRY_ROWS = {
-    "axial_length_mm": "length, mm",
-    "keratometry_dpt": "K, dpt",
-    "chamber_depth_mm": "chamber, mm",
-    "lens_thickness_mm": "lens thickness, mm",
-    "lens_power_dpt": "lens power, dpt",
-}
-
-
-def _biometry_table(before: EyeFacts, after: EyeFacts) -> Table:
-    both = [facts.numbers["eye"]["biometry"] for facts in (before, after)]
-    moments = _moments(before, after)
-    rows = [
-        (moment, *(f"{found[name]:.2f}" for name in BIOMETRY_ROWS))
-        for moment, found in zip(moments, both, strict=True)
-    ]
-    changes = (change_text(both[0][name], both[1][name]) for name in BIOMETRY_ROWS)
-    return Table(
-        "Lengths and powers of the estimated eyes",
-        (*rows, ("change", *changes)),
-        head=("", *BIOMETRY_ROWS.values()),
-        note="K of the front of the cornea, index 1.3375; chamber from the front of "
-        "the cornea to the lens or implant; lens power in the eye, at 555 nm.",
-    )
-
-
 def _eye_note(moment: str, facts: EyeFacts) -> str:
     """Return the name of an eye, its powers as entered, and spectacles for it."""
     entered = entered_text(facts.study.profile)
@@ -549,8 +539,15 @@ def _vision_table(before: EyeFacts, after: EyeFacts) -> Table:
     )
     head = ("far object, 555 nm", *_moments(before, after) * len(of_pupils))
     rows = tuple(
-        (label, *(format_value(numbers) for pair in of_pupils for numbers in pair))
-        for label, format_value in VISION_ROWS.items()
+        (
+            label,
+            *(
+                vision_cell(label, numbers, facts)
+                for pair in of_pupils
+                for numbers, facts in zip(pair, (before, after), strict=True)
+            ),
+        )
+        for label in VISION_ROWS
     )
     return Table(
         "Vision on the axis",

@@ -17,6 +17,7 @@ from clients.report.facts import (
 )
 from clients.report.html_page import Table
 from clients.report.text import entered_text, um_text
+from estimator import EyeWithImplant
 
 N_COLUMNS, N_JOINT_COLUMNS = 4, 3
 """Columns of the coefficients of one eye, and of two."""
@@ -100,8 +101,8 @@ def vision_table(facts: EyeFacts) -> Table:
     """Return the vision through both pupils, as it is and best corrected."""
     pupils = facts.numbers["pupils"]
     rows = [
-        (label, *map(format_value, pupils))
-        for label, format_value in VISION_ROWS.items()
+        (label, *(vision_cell(label, pupil, facts) for pupil in pupils))
+        for label in VISION_ROWS
     ]
     note = vision_note(pupils, facts.notation)
     drawn = facts.numbers.get("people", {"pupils": []})
@@ -121,7 +122,9 @@ def vision_note(pupils: list[dict[str, Any]], notation: Notation) -> str:
     """Return the note below numbers of vision through some pupils."""
     note = (
         f"Acuity in {NOTATION_WORDS[notation]}, in white light. Higher orders: in the "
-        "entrance pupil; maps and bars show them at the cornea."
+        "entrance pupil; maps and bars show them at the cornea. Accommodation: change "
+        "of the sharpest distance through that pupil and the correction; the amplitude "
+        "in “What is known” is that of the eye alone."
     )
     if any(p["is_beyond_measured"] for p in pupils):
         note += " * wider than the pupil measured: see “What is known”."
@@ -145,6 +148,7 @@ NOTATION_WORDS: dict[Notation, str] = {
     "meters": "logMAR and as 6/6",
     "log_mar": "logMAR",
 }
+NEAR_POINT, SEVERAL_FOCI = "near point, dpt", "several foci"
 LEAST_RATIO = 0.0005
 """Smallest visual Strehl ratio that three decimals show."""
 
@@ -160,7 +164,7 @@ VISION_ROWS: dict[str, Callable[[dict[str, Any]], str]] = {
         p["best_corrected"]["modulation"]
     ),
     "far point, dpt": lambda p: distance_text(p["far_point_dpt"]),
-    "near point, dpt": lambda p: distance_text(p["near_point_dpt"]),
+    NEAR_POINT: lambda p: distance_text(p["near_point_dpt"]),
     "accommodation, dpt": lambda p: f"{p['near_point_dpt'] - p['far_point_dpt']:.1f}",
 }
 
@@ -290,3 +294,43 @@ def range_text(
 
 def _angle_text(h_deg: float) -> str:
     return f"{h_deg:+.0f}".replace("-", "−") if h_deg else "0"
+
+
+BIOMETRY_ROWS = {
+    "axial_length_mm": "length, mm",
+    "keratometry_dpt": "K, dpt",
+    "chamber_depth_mm": "chamber, mm",
+    "lens_thickness_mm": "lens thickness, mm",
+    "lens_power_dpt": "lens power, dpt",
+}
+
+
+def biometry_table(eyes: Sequence[EyeFacts], moments: Sequence[str]) -> Table:
+    """Return lengths and powers of two eyes, and their change."""
+    both = [facts.numbers["eye"]["biometry"] for facts in eyes]
+    rows = [
+        (moment, *(f"{found[name]:.2f}" for name in BIOMETRY_ROWS))
+        for moment, found in zip(moments, both, strict=True)
+    ]
+    changes = (change_text(both[0][name], both[1][name]) for name in BIOMETRY_ROWS)
+    label = ""
+    if any(isinstance(facts.study.found, EyeWithImplant) for facts in eyes):
+        label = (
+            " The power of an implant above is the labeled one, which refers to an "
+            "aqueous of index 1.336 (ISO 11979-2)."
+        )
+    return Table(
+        "Lengths and powers of the estimated eyes",
+        (*rows, ("change", *changes)),
+        head=("", *BIOMETRY_ROWS.values()),
+        note="K of the front of the cornea, index 1.3375; chamber from the front of "
+        f"the cornea to the lens or implant; lens power in the eye, at 555 nm.{label}",
+    )
+
+
+def vision_cell(label: str, pupil: dict[str, Any], facts: EyeFacts) -> str:
+    """Return a value of `VISION_ROWS` of an eye; several foci have no near point."""
+    rings = facts.study.optics.rings
+    if label == NEAR_POINT and rings is not None and rings.lattice_mm is None:
+        return SEVERAL_FOCI
+    return VISION_ROWS[label](pupil)

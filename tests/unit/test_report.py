@@ -376,7 +376,7 @@ def test_what_a_profile_is_called_cannot_break_the_page():
 def test_two_eyes_make_one_document(myope, corrected, tmp_path):
     document = document_of([myope, corrected])
     assert document.title == "Eye report: A. Myope → worn"
-    table = document.sections[0].rows[0].blocks[0]
+    table = document.sections[0].rows[1].blocks[0]
     change = {row[0]: row for row in table.rows}["change"]
     assert float(change[-1].replace("−", "-")) == pytest.approx(
         -sum(AT_CORNEA) / 2, abs=0.15
@@ -574,7 +574,7 @@ def test_the_first_page_says_where_entered_powers_are_measured(myope):
 
 def test_a_star_is_explained_only_where_it_stands(myope, corrected, lasik):
     def notes(*facts):
-        table = document_of(list(facts)).sections[0].rows[1 - (len(facts) == 1)]
+        table = document_of(list(facts)).sections[0].rows[2 * (len(facts) > 1)]
         return table.blocks[-1].note
 
     assert "*" not in notes(myope, corrected)
@@ -635,7 +635,7 @@ def test_what_two_eyes_share_is_told_once(myope, corrected):
     assert parts.count("Higher orders") == 1
     assert parts.count("Correction worn") == 1
     assert "spectacles −4.00 dpt sph −1.00 cyl x 20° at 12 mm" in document.subtitle
-    note = document.sections[0].rows[0].blocks[0].note
+    note = document.sections[0].rows[1].blocks[0].note
     assert note.count("As spectacles at 12 mm: −4.00 dpt sph") == 2
 
 

@@ -1,6 +1,7 @@
 """Reports on one person before and after surgery."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ import pytest
 from clients.figures import (
     EyeStudy,
     draw_cross_section,
+    draw_field_maps,
     draw_psfs,
     draw_wavefront_map,
     wavefront_range_um,
@@ -172,3 +174,33 @@ def test_maps_of_two_wavefronts_can_share_their_colors():
             axes, zernike_um, radius_mm=3.0, eye_side="OD", range_um=range_um
         )
         assert axes.images[0].get_clim() == (-range_um, range_um)
+
+
+def test_a_comparison_starts_with_plain_words(before, with_implant):
+    both = replace(before, label="A (spectacles)"), replace(with_implant, label="B")
+    document = comparison_document(*both)
+    (text,) = document.sections[0].rows[0].blocks[0].paragraphs
+    assert text.startswith(
+        "This report compares A (spectacles) with B of the right eye, through a pupil "
+        "of 3 mm."
+    )
+    for facts in both:
+        log_mar = facts.chart_numbers[3.0, 0.4]["log_mar"]
+        acuity = f"{10**-log_mar:.2f}"
+        if facts.notation == "feet":
+            acuity = f"20/{20 * 10**log_mar:.0f}"
+        assert re.search(rf"{facts.label[0]}[^.]*: .*{acuity} at 40 cm", text)
+    assert "smaller rows at 6 m" in text  # by 0.5 instead of 2.5 dpt of myopia
+    assert "labeled one, which refers to an aqueous" in repr(document)
+
+
+def test_maps_of_two_eyes_have_the_same_colors(before, with_implant):
+    studies = before.study, with_implant.study
+    limits = []
+    for study in studies:
+        figure = new_figure(125.0, 85.0)
+        draw_field_maps(figure, study, compared=studies)
+        maps = [axes for axes in figure.axes if axes.get_title(loc="left")]
+        limits.append([axes.collections[0].get_clim() for axes in maps])
+    assert len(limits[0]) == 4
+    assert limits[0] == limits[1]
