@@ -56,7 +56,6 @@ PUBLISHED_ONLY: dict[str, object] = {
 TOLERANCES: tuple[str, ...] = get_args(Tolerance)
 """From the loosest to the finest."""
 
-ACCUMULATIONS: tuple[str, ...] = get_args(Accumulation)
 DEPTH_KINDS: tuple[str, ...] = get_args(DepthKind)
 OUTPUTS: tuple[str, ...] = get_args(Output)
 

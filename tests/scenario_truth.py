@@ -145,12 +145,6 @@ def modulation_sum(
     return abs(total) / np.count_nonzero(x**2 + y**2 <= pupil_mm**2 / 4.0)
 
 
-def perfect_modulation(pupil_mm: float, cpd: float) -> float:
-    """Modulation of a perfect eye in focus."""
-    ratio = NM * 1e-6 * math.degrees(1.0) * cpd / pupil_mm
-    return 2.0 / math.pi * (math.acos(ratio) - ratio * math.sqrt(1.0 - ratio**2))
-
-
 def spherical_um(square_mm2: NDArray, c40_um: float) -> NDArray:
     """C(4,0) on 6 mm whose power over 4 mm is zero."""
     rho = square_mm2 / 9.0

@@ -80,12 +80,6 @@ class PupilSurvey:
         wavelength_um = self.frames.wavelength_nm[:, None] / 1000.0
         return wavelength_um / (2.0 * self.frames.half_width_um_per_px)
 
-    @property
-    def wave_number(self) -> NDArray[np.float64]:
-        """Larger side of the spot in lambda/D, n = 2 g D / lambda, (P,)."""
-        larger: NDArray[np.float64] = (self.extent_px / self.unit_px).max(axis=1)
-        return larger
-
 
 def _disc_log_amplitude(frames: PupilFrames) -> NDArray[np.float64]:
     """Return the apodization (P, 6) over the unit disc."""

@@ -309,32 +309,22 @@ def _stored(spec, batch):
 
 def node_errors(eye, spec, plan, *, count, seed=0):
     """Errors (count,) at nodes, where only storage errs."""
-    return _grid_errors(eye, spec, plan, count, seed, share=0.0)
-
-
-def halfway_errors(eye, spec, plan, *, count, seed=0):
-    """Errors (count,) half-way between nodes of all axes at once."""
-    return _grid_errors(eye, spec, plan, count, seed, share=0.5)
-
-
-def _grid_errors(eye, spec, plan, count, seed, share):
     rng = np.random.default_rng(seed)
 
-    def between(nodes):
+    def drawn(nodes):
         if len(nodes) == 1:
             return np.full(count, nodes[0])
-        lower = rng.integers(0, len(nodes) - 1, count)
-        return (1.0 - share) * nodes[lower] + share * nodes[lower + 1]
+        return nodes[rng.integers(0, len(nodes) - 1, count)]
 
     # A node of the defocus groups is one distance, in green, at all of the paper's.
     n_distances = int(plan.nodes.defocus.counts[0])
-    object_dpt = between(np.linspace(*DISTANCES_DPT, n_distances))
+    object_dpt = drawn(np.linspace(*DISTANCES_DPT, n_distances))
     wavelengths_nm = spec.channel_wavelengths_nm
     known = {
-        "h_deg": between(plan.h_deg),
-        "v_deg": between(plan.v_deg),
-        "pupil_diameter_mm": between(plan.pupils_mm),
-        "accommodation_dpt": between(plan.accommodations_dpt),
+        "h_deg": drawn(plan.h_deg),
+        "v_deg": drawn(plan.v_deg),
+        "pupil_diameter_mm": drawn(plan.pupils_mm),
+        "accommodation_dpt": drawn(plan.accommodations_dpt),
         "wavelength_nm": wavelengths_nm[rng.integers(0, 3, count)],
     }
     states = PupilStates(
@@ -347,7 +337,7 @@ def _grid_errors(eye, spec, plan, count, seed, share):
         states,
         object_dpt,
         spectrum=None,
-        stored=share == 0.0,
+        stored=True,
     )
 
 

@@ -13,7 +13,6 @@
 
 /* Rows of a bin in vectors of eight: red, green and blue of its pixels, one after another. */
 #define ROW_FLOATS (RGB * BIN_WIDTH)
-#define ROW_VECTORS (ROW_FLOATS / 8)
 
 /* Vectors of a row whose sums are kept in registers, and the texels of zeros that the rows of
  * a kernel need, which may only touch them. */
