@@ -72,11 +72,6 @@ def row_texts(log_mar: float) -> tuple[str, str]:
     return text, f"{10.0**-log_mar:.2f}"
 
 
-def row_text(log_mar: float) -> str:
-    """Return both sizes of a row."""
-    return " · ".join(row_texts(log_mar))
-
-
 def smallest_row(rows: Sequence[float], acuity_log_mar: float) -> int | None:
     """Return the index of the smallest row that an acuity reads; None if it reads none.
 
