@@ -355,8 +355,8 @@ def _icc_curve(tag: bytes) -> Curve:
         return power_curve(1.0)
     if count == 1:
         return power_curve(float(values[0]) / 256.0)
-    places = np.linspace(0.0, 1.0, count)
-    return lambda value: np.interp(value, places, values / 65535.0)
+    nodes = np.linspace(0.0, 1.0, count)
+    return lambda value: np.interp(value, nodes, values / 65535.0)
 
 
 def _icc_parametric(tag: bytes) -> Curve:

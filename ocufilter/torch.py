@@ -260,8 +260,8 @@ class SeeThrough(torch.nn.Module):
             name: len(value) for name, value in values.items() if _is_many(name, value)
         }
         if len(set(counts.values())) > 1 or 0 in counts.values():
-            told = ", ".join(f"{name} of {count}" for name, count in counts.items())
-            raise ValueError(f"expected parameters of the same items, got {told}")
+            found = ", ".join(f"{name} of {count}" for name, count in counts.items())
+            raise ValueError(f"expected parameters of the same items, got {found}")
 
         def of_item(number: int | None) -> _Sample:
             own = {
@@ -531,9 +531,9 @@ def _each(
     n_items = len(shape)
     expected = _channels_first(shape)
     if tuple(given.shape[-n_items:]) != expected:
-        told = ", ".join(map(str, expected))
+        sizes = ", ".join(map(str, expected))
         raise ValueError(
-            f"expected a tensor of shape (..., {told}), got {tuple(given.shape)}"
+            f"expected a tensor of shape (..., {sizes}), got {tuple(given.shape)}"
         )
     batch = given.shape[:-n_items]
     arrays = given.detach().to("cpu", torch.float32).movedim(-3, -1)

@@ -66,14 +66,14 @@ def light_of(raw: NDArray[Any], color_format: int, flags: int) -> NDArray[np.flo
     rows = raw if flags & wire.TOP_FIRST else raw[::-1]
     if color_format == wire.LINEAR10:
         rows = _unpacked(rows)
-    places = (2, 1, 0) if flags & wire.IS_BGR else (0, 1, 2)
+    stored_channels = (2, 1, 0) if flags & wire.IS_BGR else (0, 1, 2)
     light = np.empty(rows.shape, np.float32)
     light[..., 3] = 1.0
     if flags & wire.IS_BLENDED:
         alpha = rows[..., 3].astype(np.float32)
         light[..., 3] = alpha / np.float32(255.0) if raw.dtype == np.uint8 else alpha
-    for channel, place in enumerate(places):
-        values = rows[..., place]
+    for channel, stored in enumerate(stored_channels):
+        values = rows[..., stored]
         if color_format == wire.SRGB8:
             light[..., channel] = _LINEAR_OF_SRGB8[values]
         elif color_format == wire.LINEAR8:

@@ -139,11 +139,11 @@ class _Descent:
         misfit = (state.value_um - self.target_um) / self.noise_um
         hessian = scaled.T @ scaled + np.eye(state.position.size)
         downhill = -(scaled.T @ misfit + state.position)
-        room = (
+        bounds = (
             np.maximum(self.low - state.position, -self.reach),
             np.minimum(self.high - state.position, self.reach),
         )
-        step = box_minimum(hessian, downhill, room)
+        step = box_minimum(hessian, downhill, bounds)
         left = np.concatenate([scaled @ step + misfit, step + state.position])
         return step, float(left @ left)
 
@@ -220,14 +220,14 @@ def fit_bounded(
 def box_minimum(
     hessian: NDArray[np.float64],
     downhill: NDArray[np.float64],
-    room: tuple[NDArray[np.float64], NDArray[np.float64]],
+    bounds: tuple[NDArray[np.float64], NDArray[np.float64]],
 ) -> NDArray[np.float64]:
     """Minimize x H x / 2 - g x over a box: active set (BVLS, Stark & Parker 1995).
 
     It works on the 45 x 45 Hessian with Cholesky solves, in a tenth of the time of
     `scipy.optimize.lsq_linear`, which decomposes the whole matrix on every pass.
     """
-    low, high = room
+    low, high = bounds
     step = _solved(hessian, downhill)
     side = np.where(step >= high, 1, np.where(step <= low, -1, 0))
     if not side.any():
@@ -235,7 +235,7 @@ def box_minimum(
     step = np.clip(step, low, high)
     pull = BOX_TOLERANCE * np.diag(hessian)  # gradient that moves x by the tolerance
     for _ in range(MAX_PASSES):
-        step, side = _descend_free(hessian, downhill, step, side, room)
+        step, side = _descend_free(hessian, downhill, step, side, bounds)
         held_back = -side * (downhill - hessian @ step) / pull
         worst = int(np.argmax(held_back))
         if held_back[worst] <= 1.0:
@@ -260,10 +260,10 @@ def _descend_free(
     downhill: NDArray[np.float64],
     step: NDArray[np.float64],
     side: NDArray[np.int64],
-    room: tuple[NDArray[np.float64], NDArray[np.float64]],
+    bounds: tuple[NDArray[np.float64], NDArray[np.float64]],
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Go to the minimum over the free unknowns, fixing each that reaches a bound."""
-    low, high = room
+    low, high = bounds
     while True:
         free = np.flatnonzero(side == 0)
         if free.size == 0:

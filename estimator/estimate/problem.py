@@ -205,11 +205,11 @@ class EstimationProblem:
         """Return the names of the parameters on a bound of their range."""
         unit = self.prior.to_unit(vector)
         low, high = self.prior.unit_bounds()
-        room = np.minimum(unit - low, high - unit)
+        distance = np.minimum(unit - low, high - unit)
         return tuple(
             name
-            for name, left in zip(PARAMETER_NAMES, room, strict=True)
-            if left < ON_BOUND_RATIO
+            for name, ratio in zip(PARAMETER_NAMES, distance, strict=True)
+            if ratio < ON_BOUND_RATIO
         )
 
 

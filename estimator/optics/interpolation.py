@@ -45,7 +45,7 @@ class CubicSpline:
 
     def __call__(self, at: ArrayLike) -> NDArray[np.float64]:
         """Return the values (*at, ...)."""
-        piece, offset = self._places(at)
+        piece, offset = self._pieces(at)
         constant, linear, square, cube = self._powers[:, piece]
         found: NDArray[np.float64] = (
             (cube * offset + square) * offset + linear
@@ -54,21 +54,21 @@ class CubicSpline:
 
     def slopes(self, at: ArrayLike) -> NDArray[np.float64]:
         """Return the first derivatives (*at, ...)."""
-        piece, offset = self._places(at)
+        piece, offset = self._pieces(at)
         _, linear, square, cube = self._powers[:, piece]
         found: NDArray[np.float64] = (
             3.0 * cube * offset + 2.0 * square
         ) * offset + linear
         return found
 
-    def _places(self, at: ArrayLike) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Return the piece of each place, and the distance from its first node."""
-        places = np.asarray(at, np.float64)
-        piece = np.searchsorted(self._nodes, places, side="right") - 1
+    def _pieces(self, at: ArrayLike) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """Return the piece of each point, and the distance from its first node."""
+        points = np.asarray(at, np.float64)
+        piece = np.searchsorted(self._nodes, points, side="right") - 1
         piece = np.clip(piece, 0, self._nodes.size - 2)
-        offset = places - self._nodes[piece]
+        offset = points - self._nodes[piece]
         inner = (1,) * (self._powers.ndim - 2)
-        return piece, np.reshape(offset, (*places.shape, *inner))
+        return piece, np.reshape(offset, (*points.shape, *inner))
 
 
 def _slopes_at_nodes(

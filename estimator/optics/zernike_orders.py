@@ -168,9 +168,9 @@ def zernike_to(
         shown = ", ".join(f"({n},{m})" for n, m in lacking)
         raise ValueError(f"order '{order}' lacks the terms {shown}: they must be 0")
     has_place = place[:n_terms] >= 0
-    places = place[:n_terms][has_place]
-    values = np.zeros((*given_um.shape[:-1], int(places.max()) + 1))
-    values[..., places] = (given_um * factor[:n_terms])[..., has_place]
+    indices = place[:n_terms][has_place]
+    values = np.zeros((*given_um.shape[:-1], int(indices.max()) + 1))
+    values[..., indices] = (given_um * factor[:n_terms])[..., has_place]
     return values / um_per_unit[..., None]
 
 

@@ -193,7 +193,7 @@ def _prism_notes(lens: Mapping[str, Any], where: str) -> list[str]:
     allowed = f"a list of up to {MAX_PRISMS} objects with amount and base"
     if not isinstance(prisms, list) or len(prisms) > MAX_PRISMS:
         raise ProfileError(f"{where}.prism", _shown(prisms), allowed)
-    told = []
+    descriptions = []
     for number, prism in enumerate(prisms):
         at = f"{where}.prism.{number}"
         if not isinstance(prism, Mapping):
@@ -203,10 +203,10 @@ def _prism_notes(lens: Mapping[str, Any], where: str) -> list[str]:
             raise ProfileError(f"{at}.amount", "is missing", "prism diopters")
         if not isinstance(base, str) or base not in BASES:
             raise ProfileError(f"{at}.base", _shown(base), " or ".join(BASES))
-        told.append(f"{amount:g} prism dpt base {base}")
-    if not told:
+        descriptions.append(f"{amount:g} prism dpt base {base}")
+    if not descriptions:
         return []
-    return [f"a prism does not blur and is left out: {', '.join(told)}"]
+    return [f"a prism does not blur and is left out: {', '.join(descriptions)}"]
 
 
 def _number(part: Mapping[str, Any], name: str, where: str) -> float | None:

@@ -218,8 +218,8 @@ class BankStore(PsfStore):
         thread_count: int | None = None,
     ) -> ComputedPsfs:
         """Return kernels from the file; see `PsfStore.computed`."""
-        places = psfs if self.spec.settings.chromatic else psfs // RGB
-        return ComputedPsfs(psfs, self._banked.select(places), Counter())
+        kernels = psfs if self.spec.settings.chromatic else psfs // RGB
+        return ComputedPsfs(psfs, self._banked.select(kernels), Counter())
 
 
 def _periphery_of(eye: EyeOptics) -> PeripheralResidual | None:

@@ -245,8 +245,8 @@ class Gpu:
 
     def upload_parts(self, name: str, **arrays: NDArray[Any]) -> dict[str, BufferPart]:
         """Copy arrays to a named buffer in one transfer; return the part of each."""
-        words, places = _joined(arrays)
-        return _parts(self.upload(name, words), places)
+        words, ranges = _joined(arrays)
+        return _parts(self.upload(name, words), ranges)
 
     def own_parts(self, **arrays: NDArray[Any]) -> dict[str, BufferPart]:
         """Copy arrays to a new buffer, which the caller releases; return the parts.
@@ -255,14 +255,14 @@ class Gpu:
         ------
         OutOfGpuMemory
         """
-        words, places = _joined(arrays)
+        words, ranges = _joined(arrays)
         try:
             buffer = self.context.buffer(words)
         except moderngl.Error as error:
             raise OutOfGpuMemory(
                 f"cannot allocate {words.nbytes} bytes: {error}"
             ) from error
-        return _parts(buffer, places)
+        return _parts(buffer, ranges)
 
     def write(self, buffer: Buffer, data: NDArray[Any], *, offset: int = 0) -> None:
         """Copy an array into a buffer."""
@@ -510,20 +510,20 @@ def _context_on(index: int) -> moderngl.Context:
 def _joined(
     arrays: dict[str, NDArray[Any]],
 ) -> tuple[NDArray[np.uint8], dict[str, tuple[int, int]]]:
-    """Return arrays one after the other, aligned, and the place of each in bytes."""
-    places, end = {}, 0
+    """Return aligned arrays one after the other, and first byte and size of each."""
+    ranges, end = {}, 0
     for name, array in arrays.items():
-        places[name] = end, max(array.nbytes, PART_ALIGNMENT)
-        end += -(-places[name][1] // PART_ALIGNMENT) * PART_ALIGNMENT
+        ranges[name] = end, max(array.nbytes, PART_ALIGNMENT)
+        end += -(-ranges[name][1] // PART_ALIGNMENT) * PART_ALIGNMENT
     joined = np.zeros(end, np.uint8)
     for name, array in arrays.items():
-        first = places[name][0]
+        first = ranges[name][0]
         joined[first : first + array.nbytes] = _bytes_of(np.ascontiguousarray(array))
-    return joined, places
+    return joined, ranges
 
 
-def _parts(buffer: Buffer, places: dict[str, tuple[int, int]]) -> dict[str, BufferPart]:
-    return {name: BufferPart(buffer, *place) for name, place in places.items()}
+def _parts(buffer: Buffer, ranges: dict[str, tuple[int, int]]) -> dict[str, BufferPart]:
+    return {name: BufferPart(buffer, *part) for name, part in ranges.items()}
 
 
 def _bytes_of(array: NDArray[Any]) -> NDArray[np.uint8]:

@@ -80,16 +80,16 @@ class PackedKernels:
     spread_px: NDArray[np.float64]
     lost_energy_ratio: NDArray[np.float64]
 
-    def select(self, places: NDArray[np.int64]) -> PackedKernels:
-        """Return the kernels at ``places``."""
-        widths, heights = box_sizes(self.reach_px[places])
-        starts, sizes = self.offsets[places], widths * heights
+    def select(self, indices: NDArray[np.int64]) -> PackedKernels:
+        """Return the kernels at indices (m,)."""
+        widths, heights = box_sizes(self.reach_px[indices])
+        starts, sizes = self.offsets[indices], widths * heights
         own = [
             self.weights[start : start + size]
             for start, size in zip(starts.tolist(), sizes.tolist(), strict=True)
         ]
         arrays = {
-            name: getattr(self, name)[places]
+            name: getattr(self, name)[indices]
             for name in (
                 *("reach_px", "radius_px"),
                 *("peak_ratio", "spread_px", "lost_energy_ratio"),
@@ -102,9 +102,9 @@ class PackedKernels:
         )
 
     def with_kernels(
-        self, places: NDArray[np.int64], others: PackedKernels
+        self, indices: NDArray[np.int64], others: PackedKernels
     ) -> PackedKernels:
-        """Return the kernels with those at ``places`` replaced by others."""
+        """Return the kernels with those at indices (m,) replaced by others."""
         arrays = {
             name: getattr(self, name).copy()
             for name in (
@@ -113,8 +113,8 @@ class PackedKernels:
             )
         }
         for name, array in arrays.items():
-            array[places] = getattr(others, name)
-        arrays["offsets"][places] += self.weights.size
+            array[indices] = getattr(others, name)
+        arrays["offsets"][indices] += self.weights.size
         return replace(
             self, weights=np.concatenate([self.weights, others.weights]), **arrays
         )
@@ -205,14 +205,14 @@ def _ends(line: NDArray[np.float64], allowed: float) -> tuple[int, int, float]:
     Each end of the line removes at most the allowed light.
     """
     full = len(line) // 2
-    places = np.arange(-full, full + 1)
+    offsets_px = np.arange(-full, full + 1)
     first, after = (
         int(np.searchsorted(np.cumsum(side), allowed, side="right"))
         for side in (line[:full], line[:full:-1])
     )
     kept = slice(first, line.size - after)
-    shift_px = (line @ places) / max(line.sum(), 1e-12)
-    kept_px = (line[kept] @ places[kept]) / max(line[kept].sum(), 1e-12)
+    shift_px = (line @ offsets_px) / max(line.sum(), 1e-12)
+    kept_px = (line[kept] @ offsets_px[kept]) / max(line[kept].sum(), 1e-12)
     return full - first, full - after, float(kept_px - shift_px)
 
 

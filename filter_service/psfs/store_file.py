@@ -196,8 +196,8 @@ def write_file(
     NotStorable, OSError
     """
     tree, arrays = pack(value)
-    places, n_bytes = _places(arrays)
-    header = json.dumps({"arrays": places, "tree": tree}).encode()
+    layout, n_bytes = _layout(arrays)
+    header = json.dumps({"arrays": layout, "tree": tree}).encode()
     start = _round_up(PREAMBLE.size + len(header), PAGE_BYTES)
     descriptor, name = tempfile.mkstemp(
         prefix=path.stem[:16] + ".", suffix=UNFINISHED, dir=path.parent
@@ -322,13 +322,13 @@ def _round_up(size: int, step: int) -> int:
     return -(-size // step) * step
 
 
-def _places(arrays: dict[str, NDArray[Any]]) -> tuple[dict[str, list[Any]], int]:
+def _layout(arrays: dict[str, NDArray[Any]]) -> tuple[dict[str, list[Any]], int]:
     """Return [dtype, shape, start] of each array, and their total size."""
-    places, end = {}, 0
+    layout, end = {}, 0
     for key, array in arrays.items():
-        places[key] = [array.dtype.str, array.shape, end]
+        layout[key] = [array.dtype.str, array.shape, end]
         end += _round_up(array.nbytes, ALIGNMENT_BYTES)
-    return places, end
+    return layout, end
 
 
 def _blocks(arrays: dict[str, NDArray[Any]]) -> Iterator[bytes | memoryview]:

@@ -34,22 +34,22 @@ def split_bands(bands: NDArray[Any], band_of: NDArray[np.int64]) -> NDArray[np.f
 
 
 def joined_bands(
-    colors: Sequence[NDArray[Any]], places: NDArray[np.int64]
+    colors: Sequence[NDArray[Any]], channels: NDArray[np.int64]
 ) -> NDArray[np.float32]:
     """Return the bands (height, width, n) of frames.
 
     Parameters
     ----------
     colors : sequence of (height, width, 3)
-    places : (n, 2)
+    channels : (n, 2)
         Frame and channel of each band.
     """
     height, width, _ = colors[0].shape
-    found = np.empty((height, width, len(places)), np.float32)
+    found = np.empty((height, width, len(channels)), np.float32)
     frames = [np.ascontiguousarray(color, np.float32) for color in colors]
     loops().call(
         "join_bands",
         *(shared_threads(), np.array([pointer_to(frame) for frame in frames])),
-        *(places @ np.array([RGB, 1]), height * width, len(places), found),
+        *(channels @ np.array([RGB, 1]), height * width, len(channels), found),
     )
     return found
