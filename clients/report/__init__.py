@@ -5,6 +5,7 @@ make       builds reports from profiles, and identifies them
 facts      computed content of a report on one eye: numbers, letter charts, names
 text       sentences: corrections, method, provenance, literature references
 tables     tables of a report
+plain      the first paragraph of a report on two eyes
 content    the reports of one eye and of two eyes
 html_page  sections, rows, tables and figures, and their HTML, from which a PDF is
            printed

@@ -5,6 +5,7 @@ server         HTTP server: app, image websocket, limits on connections
 guard          access control by token, limits on requests
 page           the page: layout and event handlers
 header         downloads, and the link in the browser's address
+page_texts     explanations on the page
 page_state     state of a page, independent of the layout, and as text for links
 controls       the numbers that can be entered, with limits, steps, initial values
 written        those numbers as people write them
@@ -14,6 +15,7 @@ correction_hints  what a correction does, and its additions in spectacles
 eye_panel      those entries on the page
 eyes_card      which eyes and states are shown, with the panels of their entries
 scenario_menu  scenarios, each with its scene, conditions, and states A and B
+sight          how well an eye reads at a distance, in a sentence
 blur_widths    angular sizes of familiar things, for the width of a blur
 picture        pictures with depth: scenes, glTF files, photos, a letter chart
 picture_panel  scene and filtered picture with a split, with picture_view.js

@@ -103,7 +103,7 @@ class PageState:
     number : number of the last request
     keeps_focus : whether the next picture keeps the focus, as it came with the link or
         the scenario that selected it
-    light_before : light and pupil before a scene set them, or None
+    light_before : light before a scene set it, or None; and the pupil then
     valid_profiles : the last valid profile of each eye
     """
 
@@ -125,7 +125,8 @@ class PageState:
     pipeline: Pipeline = "exact"
     number: int = 0
     keeps_focus: bool = False
-    light_before: tuple[str, float] | None = None
+    light_before: str | None = None
+    pupil_before_mm: float = PUPIL.initial
     valid_profiles: dict[EyeName, Mapping[str, Any]] = field(default_factory=dict)
 
     @property
@@ -303,10 +304,12 @@ class PageState:
         light, before = SCENE_LIGHTS.get(scene), self.light_before
         self.light_before = None
         if light is not None and not self.keeps_focus:
-            self.light_before = before or (self.light, self.values[PUPIL.name])
+            if before is None:
+                self.pupil_before_mm = self.values[PUPIL.name]
+            self.light_before = before or self.light
             self.set_light(light)
         elif before is not None and self.light in SCENE_LIGHTS.values():
-            self.light, self.values[PUPIL.name] = before
+            self.light, self.values[PUPIL.name] = before, self.pupil_before_mm
 
     def look(self, *, is_reading: bool) -> None:
         """Look straight ahead and far, or down at a reading distance."""

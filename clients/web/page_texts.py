@@ -2,13 +2,16 @@
 
 PICTURE_HELP = (
     "Left of the divider is the scene, right of it what the eye sees; in a comparison, "
-    "A and B. Drag the divider, or hold a button to see one of them alone. A click "
-    "focuses the eye on what is there. The picture is sharpest in the direction of the "
-    "gaze, the center: objects at the side are blurred, as in every eye."
+    "A and B, which “Side by side” shows whole. Drag the divider, or hold a button to "
+    "see one of them alone. A click focuses the eye on what is there. The picture is "
+    "sharpest in the direction of the gaze, the center: objects at the side are "
+    "blurred, as in every eye."
 )
 CONDITIONS_HELP = (
     "They hold for all pictures. “Light” sets the pupil by the luminance of the "
-    "surroundings and the age (Watson and Yellott 2012). The focus is the "
+    "surroundings and the age (Watson and Yellott 2012). Blur is smaller and acuity "
+    "higher through a pupil of 3 mm than through a wide one: uncorrected, 2.50 dpt of "
+    "myopia read 0.20 through 3.3 mm, where people read 0.17 to 0.19. The focus is the "
     "distance that the eye looks at; “Distance” is that of the letter chart or of a "
     "photograph without depth. The pencil beside a slider takes a typed value, such as "
     "6 m, 40 cm, 20 ft or 2.5 dpt."
