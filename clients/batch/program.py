@@ -5,7 +5,8 @@ from __future__ import annotations
 import os
 import signal
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import typer
@@ -141,8 +142,13 @@ def report_lines(summary: dict[str, Any], options: ImageSetOptions) -> list[str]
     return lines + [f"note: {note_line(note)}" for note in summary["notes"]]
 
 
-def failure_lines(summary: dict[str, Any]) -> list[str]:
-    """Format the first failures and the number of all."""
+def print_lines(lines: Iterable[str]) -> None:
+    """Print lines of text, whose names may come from files."""
+    sys.stdout.writelines(f"{printable(line)}\n" for line in lines)
+
+
+def print_failures(summary: dict[str, Any]) -> bool:
+    """Print the first failures and the number of all; return whether there are any."""
     failures = summary.get("failures", [])
     lines = [
         f"batch: {one['profile']}, {one['frame']}: {one['error']}"
@@ -150,7 +156,26 @@ def failure_lines(summary: dict[str, Any]) -> list[str]:
     ]
     if failures:
         lines.append(f"batch: {len(failures)} images failed; the manifest lists them")
-    return lines
+    sys.stderr.writelines(f"{printable(line)}\n" for line in lines)
+    return bool(failures)
+
+
+@contextmanager
+def resumable(command: str) -> Iterator[None]:
+    """Exit with one line if the run of a command is stopped, or its engine fails.
+
+    SIGTERM stops the run as Ctrl-C does.
+    """
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        yield
+    except KeyboardInterrupt:
+        sys.stderr.write(
+            f"{command}: stopped; run the same command again to continue\n"
+        )
+        raise typer.Exit(EXIT_INTERRUPTED) from None
+    except EngineUnusable as error:
+        raise CommandFailed(str(error)) from error
 
 
 @with_options
@@ -187,25 +212,15 @@ def batch(options: BatchOptions, json_output: Json = False) -> None:
     its own, by --eyes, --sample-eyes or --bank, they are OUT/images/FRAME.png, with
     labels in OUT/labels.csv.  The exit code is 1 if some frames failed.
     """  # noqa: D301  (\b keeps the lines of the list)
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
-    try:
+    with resumable("batch"):
         summary = run(options, quiet=json_output)
-    except KeyboardInterrupt:
-        sys.stderr.write("batch: stopped; run the same command again to continue\n")
-        raise typer.Exit(EXIT_INTERRUPTED) from None
-    except EngineUnusable as error:
-        raise CommandFailed(str(error)) from error
     if json_output:
         print_json(summary)
     elif options.dry_run:
-        _print(lines_of(summary, options.price_per_core_hour))
+        print_lines(lines_of(summary, options.price_per_core_hour))
     else:
-        _print(report_lines(summary, options))
-    failures = failure_lines(summary)
-    sys.stderr.writelines(f"{printable(line)}\n" for line in failures)
-    if failures or (options.dry_run and all(p["errors"] for p in summary["profiles"])):
+        print_lines(report_lines(summary, options))
+    if print_failures(summary) or (
+        options.dry_run and all(p["errors"] for p in summary["profiles"])
+    ):
         raise typer.Exit(EXIT_FAILURE)
-
-
-def _print(lines: Sequence[str]) -> None:
-    sys.stdout.writelines(f"{printable(line)}\n" for line in lines)

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import signal
-import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,11 +13,17 @@ import typer
 from clients.batch.manifest import below
 from clients.batch.options import profiles_of, workers_and_threads
 from clients.batch.pools import ProcessPool
-from clients.batch.program import failure_lines, filter_batch, report_lines
+from clients.batch.program import (
+    filter_batch,
+    print_failures,
+    print_lines,
+    report_lines,
+    resumable,
+)
 from clients.batch.run import Batch, check_folder, check_links, only_one
 from clients.batch.source import Constant, Pinhole, SourceFrame, States
 from clients.batch.views import Views
-from clients.batch.work import EngineUnusable, Job, batch_settings
+from clients.batch.work import Job, batch_settings
 from clients.commands.options import read_object, with_options
 from clients.frame_log import Notes, add_notes, note_line
 from clients.provenance import code_version
@@ -27,15 +31,9 @@ from clients.stimuli.display import Display
 from clients.stimuli.options import StimuliOptions, check, displays_of
 from clients.stimuli.sets import described, file_notes, stimuli_of, write_stimulus
 from clients.stimuli.stimulus import Stimulus
-from estimator.bounded_files import loads_bounded, printable, read_bytes
+from estimator.bounded_files import loads_bounded, read_bytes
 from filter_service.atomic_files import write_atomically
-from filter_service.command_line import (
-    EXIT_FAILURE,
-    EXIT_INTERRUPTED,
-    CommandFailed,
-    Json,
-    print_json,
-)
+from filter_service.command_line import EXIT_FAILURE, Json, print_json
 
 ORIGINALS, LISTING = "originals", "stimuli.json"
 MAX_LISTING_BYTES, MAX_LISTING_ITEMS = 16_000_000, 2_000_000
@@ -291,21 +289,11 @@ def stimuli(options: StimuliOptions, json_output: Json = False) -> None:
     DIR/stimuli.json.  What eyes see is in DIR/PROFILE/NAME.png, with a manifest as of
     `ocufilter batch`.  Run the same command again to continue.
     """
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
-    try:
+    with resumable("stimuli"):
         summary = run(options, quiet=json_output)
-    except KeyboardInterrupt:
-        sys.stderr.write("stimuli: stopped; run the same command again to continue\n")
-        raise typer.Exit(EXIT_INTERRUPTED) from None
-    except EngineUnusable as error:
-        raise CommandFailed(str(error)) from error
     if json_output:
         print_json(summary)
     else:
-        sys.stdout.writelines(
-            f"{printable(line)}\n" for line in lines_of(summary, options)
-        )
-    failures = failure_lines(summary.get("seen", {}))
-    sys.stderr.writelines(f"{printable(line)}\n" for line in failures)
-    if failures:
+        print_lines(lines_of(summary, options))
+    if print_failures(summary.get("seen", {})):
         raise typer.Exit(EXIT_FAILURE)
