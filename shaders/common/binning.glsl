@@ -1,34 +1,34 @@
 // Iteration over the fragments whose light reaches a bin, in scan order: blocks row by row
 // through the bin's window, surface after surface, and the fragments of each in order.
 // Each thread takes one contiguous part of that sequence, so the list is the same for any
-// number of threads, and for every run.  The sequence is divided into stretches of a
+// number of threads, and for every run.  The sequence is divided into ranges of a
 // block's slots, because without wide blur there are fewer blocks than threads.
 // A window (first column and row of blocks, last ones plus one) contains every block that
 // reaches the bin, and no row or column without one.
 // Needs buffers `blocks`, `places` and uniforms `tile_grid`, `surface_count` in scope.
 
-struct Walk {
+struct Cursor {
     ivec2 bin;
     ivec2 first;                  // block of the window
     ivec2 size;                   // of the window in blocks
-    int next;                     // next stretch of this thread in the sequence
+    int next;                     // next range of this thread in the sequence
     int end;
 };
 
-struct Stretch {
+struct SlotRange {
     int block;
     uint first;                   // slot
     uint end;
 };
 
-const int STRETCHES = THREADS / STRETCH_SLOTS;  // of a block
+const int RANGES_PER_BLOCK = THREADS / RANGE_SLOTS;
 
-Walk start_walk(ivec2 bin, ivec4 window) {
+Cursor cursor_at(ivec2 bin, ivec4 window) {
     ivec2 size = max(window.zw - window.xy, 0);
-    int length = surface_count * size.x * size.y * STRETCHES;
+    int length = surface_count * size.x * size.y * RANGES_PER_BLOCK;
     int share = (length + GROUP_THREADS - 1) / GROUP_THREADS;
     int start = int(gl_LocalInvocationIndex) * share;
-    return Walk(bin, window.xy, size, start, min(start + share, length));
+    return Cursor(bin, window.xy, size, start, min(start + share, length));
 }
 
 // Whether a block at `at`, of any surface, has a fragment that may reach the bin.
@@ -42,21 +42,21 @@ bool block_reaches(int block, ivec2 at, ivec2 bin) {
 }
 
 // Next fragments of this thread's part, from a block in reach; false if there are none.
-bool next_stretch(inout Walk walk, out Stretch stretch) {
-    while (walk.next < walk.end) {
-        int place = walk.next / STRETCHES;
-        int part = walk.next - place * STRETCHES;
-        int row = place / walk.size.x;
-        ivec2 at = walk.first + ivec2(place - row * walk.size.x, row % walk.size.y);
-        int block = (row / walk.size.y * tile_grid.y + at.y) * tile_grid.x + at.x;
-        int count = int(blocks[block].x) - part * STRETCH_SLOTS;
-        if (count > 0 && block_reaches(block, at, walk.bin)) {
-            int first = block * THREADS + part * STRETCH_SLOTS;
-            stretch = Stretch(block, uint(first), uint(first + min(count, STRETCH_SLOTS)));
-            ++walk.next;
+bool next_slots(inout Cursor cursor, out SlotRange slots) {
+    while (cursor.next < cursor.end) {
+        int place = cursor.next / RANGES_PER_BLOCK;
+        int part = cursor.next - place * RANGES_PER_BLOCK;
+        int row = place / cursor.size.x;
+        ivec2 at = cursor.first + ivec2(place - row * cursor.size.x, row % cursor.size.y);
+        int block = (row / cursor.size.y * tile_grid.y + at.y) * tile_grid.x + at.x;
+        int count = int(blocks[block].x) - part * RANGE_SLOTS;
+        if (count > 0 && block_reaches(block, at, cursor.bin)) {
+            int first = block * THREADS + part * RANGE_SLOTS;
+            slots = SlotRange(block, uint(first), uint(first + min(count, RANGE_SLOTS)));
+            ++cursor.next;
             return true;
         }
-        walk.next = (place + 1) * STRETCHES;
+        cursor.next = (place + 1) * RANGES_PER_BLOCK;
     }
     return false;
 }

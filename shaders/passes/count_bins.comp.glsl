@@ -76,16 +76,16 @@ void main() {
     ivec2 bin = ivec2(gl_WorkGroupID.xy);
     int index = bin.y * int(gl_NumWorkGroups.x) + bin.x;
     ivec4 window = find_window(bin);
-    Walk walk = start_walk(bin, window);
+    Cursor cursor = cursor_at(bin, window);
     uint count = 0u;
     uint edges = 0u;
     uint covered = 0u;
     uint bright = 0u;
-    Stretch stretch;
-    while (next_stretch(walk, stretch)) {
+    SlotRange slots;
+    while (next_slots(cursor, slots)) {
         // Where light of a hidden surface arrives, a surface lies in front of it.
-        bool is_hidden = stretch.block >= tile_grid.x * tile_grid.y;
-        for (uint slot = stretch.first; slot < stretch.end; ++slot) {
+        bool is_hidden = slots.block >= tile_grid.x * tile_grid.y;
+        for (uint slot = slots.first; slot < slots.end; ++slot) {
             uvec4 place = places[slot];
             uint tiles = tiles_in_reach(place, bin);
             count += tiles != 0u ? 1u : 0u;

@@ -29,10 +29,10 @@ void main() {
     int index = first_bin + int(gl_WorkGroupID.x);
     ivec2 bin = ivec2(index % bin_columns, index / bin_columns);
     uint count = 0u;
-    Stretch stretch;
-    Walk walk = start_walk(bin, windows[index]);
-    while (next_stretch(walk, stretch)) {
-        for (uint slot = stretch.first; slot < stretch.end; ++slot)
+    SlotRange slots;
+    Cursor cursor = cursor_at(bin, windows[index]);
+    while (next_slots(cursor, slots)) {
+        for (uint slot = slots.first; slot < slots.end; ++slot)
             count += tiles_in_reach(places[slot], bin) != 0u ? 1u : 0u;
     }
     counts[gl_LocalInvocationIndex] = count;
@@ -40,9 +40,9 @@ void main() {
     uint at = offsets[index];
     uint last = at + list_capacity;
     for (uint other = 0u; other < gl_LocalInvocationIndex; ++other) at += counts[other];
-    walk = start_walk(bin, windows[index]);
-    while (next_stretch(walk, stretch)) {
-        for (uint slot = stretch.first; slot < stretch.end; ++slot) {
+    cursor = cursor_at(bin, windows[index]);
+    while (next_slots(cursor, slots)) {
+        for (uint slot = slots.first; slot < slots.end; ++slot) {
             uint tiles = tiles_in_reach(places[slot], bin);
             if (tiles == 0u) continue;
             if (at < last) entries[at] = pack_entry(slot, tiles);

@@ -116,7 +116,7 @@ HARDWARE_SPLAT = {
 latency of fetches.  On an H100, this is 1.4 to 1.9 times as fast as groups of 64
 threads that load 128 fragments to shared memory and fetch one texel at a time."""
 
-HARDWARE_STRETCH_SLOTS = 16
+HARDWARE_RANGE_SLOTS = 16
 """Slots of a block per thread.  A bin has more threads than blocks in its window, so
 that blocks are divided; a software renderer processes whole blocks."""
 
@@ -402,8 +402,8 @@ class ListPasses:
     @property
     def _list_threads(self) -> dict[str, int]:
         if self.strip.gpu.is_software:
-            return {"GROUP_THREADS": SOFTWARE_LIST_THREADS, "STRETCH_SLOTS": THREADS}
-        return {"GROUP_THREADS": THREADS, "STRETCH_SLOTS": HARDWARE_STRETCH_SLOTS}
+            return {"GROUP_THREADS": SOFTWARE_LIST_THREADS, "RANGE_SLOTS": THREADS}
+        return {"GROUP_THREADS": THREADS, "RANGE_SLOTS": HARDWARE_RANGE_SLOTS}
 
     @property
     def _splat_variants(self) -> dict[int, dict[str, int]]:
