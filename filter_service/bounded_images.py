@@ -91,7 +91,7 @@ Source = Path | bytes
 
 @dataclass(frozen=True)
 class Container:
-    """What the parts of a file say that Pillow does not tell.
+    """Properties of a file that Pillow does not report.
 
     Attributes
     ----------

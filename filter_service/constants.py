@@ -134,9 +134,9 @@ MERGE_CONTRAST_POWER = 1.5
 
 MERGE_FADE_RATIO = 0.05
 """Squares that miss a limit of merging by less than this ratio do not merge, but their
-pixels are moved toward the mean of the square, the more the less they miss it: no
-square merges at once.  They err as if `MERGE_CONTRAST` were larger by a third of this
-ratio: 0.0295 with them is as exact as 0.03 without."""
+pixels are moved toward the mean of the square, more so the closer they are to the
+limit, so that no square merges abruptly.  The error is as if `MERGE_CONTRAST` were
+larger by a third of this ratio: 0.0295 with them is as exact as 0.03 without."""
 
 MERGE_MIDTONE = 0.2
 MERGE_DARKEST = 0.0155

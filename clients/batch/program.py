@@ -22,9 +22,9 @@ from clients.batch.options import (
 from clients.batch.pools import THREADS_VARIABLE, ProcessPool, RayPool
 from clients.batch.run import (
     Batch,
-    begin_anew,
     check_folder,
     check_links,
+    discard_results,
     only_one,
     run_batch,
 )
@@ -91,7 +91,7 @@ def filter_batch(
         Called once the folder is known to belong to the batch.
     """
     if overwrite:
-        begin_anew(batch)
+        discard_results(batch)
     with (
         Manifest(batch.out, batch.described(), facts=batch.facts()) as manifest,
         Progress("batch", quiet=quiet) as progress,

@@ -207,7 +207,7 @@ def check_folder(out: Path, *, own: Sequence[str] = ()) -> None:
         )
 
 
-def begin_anew(batch: Batch) -> None:
+def discard_results(batch: Batch) -> None:
     """Remove the results that the manifest lists, and replace it by the batch's.
 
     The caller must hold the lock of `only_one`.  If this is interrupted, the earlier

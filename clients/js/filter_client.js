@@ -86,7 +86,7 @@ export class FilterClient {
       ours,
     );
     // An eye may be ready before `accepted` resolves. After a lost connection, `begin` sends
-    // the profile again, and its replies are counted anew.
+    // the profile again, and counts its replies from zero.
     const isReady = (reply) => ours(reply) && reply.type === "ready";
     let missing = 0;
     let ready = null;

@@ -154,7 +154,7 @@ def parsed(data: bytes) -> Hello | Memory | Frame:
     Raises
     ------
     ValueError
-        If it is none.
+        If its kind is unknown or its size is wrong.
     """
     structure = _KINDS.get(kind_of(data))
     if structure is None or len(data) != ctypes.sizeof(structure):

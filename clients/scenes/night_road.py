@@ -53,8 +53,8 @@ LANE_M, ONCOMING_X_M = 3.5, -3.5
 EYE_HEIGHT_M = 1.2
 
 _BEAM_CD, _BEAM_WIDTH_DEG, _CUTOFF_DEG = 18_000.0, 16.0, 0.57
-"""Largest intensity of the own low beam, its width, and how far below the horizon it
-ends."""
+"""Largest intensity of the driver's own low beam, its width, and how far below the
+horizon it ends."""
 
 _STREET_LAMP_CD, _STREET_LAMP_M2 = 700.0, 0.06
 _STREET_LAMPS_M = tuple((3.4, 7.0, -z) for z in (30.0, 65.0, 100.0, 135.0, 170.0))

@@ -221,7 +221,7 @@ class CoefficientTable:
         Raises
         ------
         ProfileError
-            The key looks like a setting, but is none.
+            The key resembles a setting but is not one.
         """
         if self.setting(key, value, where):
             return

@@ -288,7 +288,7 @@ def published_eye(name: str) -> PublishedEye:
     Raises
     ------
     ValueError
-        The name is none of `bodies.PUBLISHED_NAMES`.
+        The name is not in `bodies.PUBLISHED_NAMES`.
     """
     if name not in PUBLISHED_NAMES:
         known = ", ".join(PUBLISHED_NAMES)

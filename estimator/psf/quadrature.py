@@ -31,8 +31,8 @@ MARGIN, MIN_MARGIN_PX = 100.0, 6.0
 derivative by the pupil of a sharp image has an error of 0.2 % instead of 0.03 %."""
 
 MAX_SPOT_PX = 80
-"""Radius of a spot above which its kernel is that of `compute_psf_batch`: the time of
-quadrature grows with the fourth power."""
+"""Radius of a spot above which `compute_psf_batch` computes its kernel: the time of
+quadrature grows with the fourth power of the radius."""
 
 CHORDS_AT_A_TIME = 32
 

@@ -244,8 +244,8 @@ def best_lens(
             measure=measure,
             has_cylinder=has_cylinder,
             settings=as_settings(settings),
-            # A builder of its own builds in this thread: its worker would start anew
-            # for each lens.
+            # The default builder works in this thread: a worker process would have
+            # to start again for each lens.
             builder=open_inline_builder(closing) if builder is None else builder,
         )
 

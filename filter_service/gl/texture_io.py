@@ -344,8 +344,8 @@ class TextureIo:
         """
         gl = self._gl
         gl.glBindFramebuffer(GL_DRAW_FRAMEBUFFER, self._framebuffer.value)
-        # Attached anew each time: a deleted texture's name may now be of another one,
-        # and as long as it is attached, draws to a deleted texture succeed.
+        # Attached for each call: the name of a deleted texture may belong to another
+        # one now, and draws to a deleted texture succeed while it is attached.
         gl.glFramebufferTexture2D(
             *(GL_DRAW_FRAMEBUFFER, GL_COLOR_ATTACHMENT0, GL_TEXTURE_2D, 0, 0)
         )

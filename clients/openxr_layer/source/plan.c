@@ -64,9 +64,9 @@ static bool plan_views(session *at, plan *p) {
     return true;
 }
 
-/* Find the quads above the projection, up to a layer that is none: those hide what is
- * below them, and are drawn into the projection.  Where that is blended with what is below
- * it, they are left alone. */
+/* Find the quads above the projection, up to the first layer of another kind.  They hide
+ * what is below them and are drawn into the projection.  If the projection is blended with
+ * the layers below it, quads are left alone. */
 static void plan_quads(session *at, const XrFrameEndInfo *info, plan *p) {
     if (at->link.leaves_quads ||
         p->layer->layerFlags & XR_COMPOSITION_LAYER_BLEND_TEXTURE_SOURCE_ALPHA_BIT)
