@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from filter_service.heap import resident_memory_mb
-from filter_service.rendering.native.frame_record import TRIM_INTERVAL, Arrays
+from filter_service.rendering.native.frame_arrays import TRIM_INTERVAL, Arrays
 
 LARGE, SMALL = 12_000_000, 1_000_000
 

@@ -1,7 +1,8 @@
 """Frame engine of compiled loops (C), for machines without a GPU.
 
 renderer      the engine, its state between frames, and two lanes
-frame_record  input record of the loops, its arrays and kernel plan
+frame_record  input record of the loops, and the plan of kernels
+frame_arrays  memory that frames reuse
 """
 
 import lazy_loader

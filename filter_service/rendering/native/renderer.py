@@ -38,8 +38,8 @@ from filter_service.rendering.frame import (
 )
 from filter_service.rendering.frame_kernels import Fill, MissingPsfs
 from filter_service.rendering.image_cells import ImageCells, KernelsTooLarge
+from filter_service.rendering.native.frame_arrays import Arrays
 from filter_service.rendering.native.frame_record import (
-    Arrays,
     BlendSizes,
     FrameRecord,
     KernelPlan,
