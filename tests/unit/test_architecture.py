@@ -80,8 +80,8 @@ EXAMPLES_IMPORT = {
 }
 """Besides the standard library and the public names."""
 
-EYE_ROOMS = {
-    # room of the estimator: the other rooms that it may import
+ESTIMATOR_SUBPACKAGES = {
+    # subpackage of the estimator: the others that it may import
     "native": (),
     "optics": ("native",),
     "wavefront": ("native", "optics"),
@@ -105,9 +105,9 @@ EYE_ROOMS = {
         *("wavefront", "optics"),
     ),
 }
-"""From light to an eye over its field: each room knows only those before it."""
+"""From light to an eye over its field: each knows only those before it."""
 
-FILTER_ROOMS = {
+FILTER_SUBPACKAGES = {
     "gl": (),
     "native": (),
     "wire": (),
@@ -119,9 +119,9 @@ FILTER_ROOMS = {
     "correcting": ("filtering", "rendering"),
     "service": ("filtering", "building", "wire"),
 }
-"""A frame's data runs one way; each room knows only those before it."""
+"""A frame's data runs one way; each knows only those before it."""
 
-ROOMS = {"estimator": EYE_ROOMS, "filter_service": FILTER_ROOMS}
+SUBPACKAGES = {"estimator": ESTIMATOR_SUBPACKAGES, "filter_service": FILTER_SUBPACKAGES}
 
 
 KNOW_MESSAGES = ("service", "wire")
@@ -260,19 +260,19 @@ def test_examples_use_what_the_face_shows_and_nothing_else():
     assert not wrong, "\n".join(wrong)
 
 
-def _rooms():
-    return [(package, room) for package, rooms in ROOMS.items() for room in rooms]
+def _subpackages():
+    return [(package, name) for package, names in SUBPACKAGES.items() for name in names]
 
 
-@pytest.mark.parametrize(("package", "room"), _rooms())
-def test_rooms_import_only_those_before_them(package, room):
-    rooms = ROOMS[package]
-    allowed = tuple(f"{package}.{name}" for name in (room, *rooms[room]))
-    all_rooms = tuple(f"{package}.{name}" for name in rooms)
+@pytest.mark.parametrize(("package", "subpackage"), _subpackages())
+def test_subpackages_import_only_those_before_them(package, subpackage):
+    earlier = SUBPACKAGES[package]
+    allowed = tuple(f"{package}.{name}" for name in (subpackage, *earlier[subpackage]))
+    every = tuple(f"{package}.{name}" for name in earlier)
     wrong = [
         f"{entry.file}:{entry.line} imports {entry.module}"
-        for entry in package_imports(f"{package}/{room}")
-        if _may(entry.module, all_rooms) and not _may(entry.module, allowed)
+        for entry in package_imports(f"{package}/{subpackage}")
+        if _may(entry.module, every) and not _may(entry.module, allowed)
     ]
     assert not wrong, "\n".join(wrong)
 
@@ -306,19 +306,19 @@ def test_what_engines_share_knows_no_engine():
 def test_only_the_service_knows_messages():
     wrong = [
         f"{entry.file}:{entry.line} imports {entry.module}"
-        for room in FILTER_ROOMS
-        if room not in KNOW_MESSAGES
-        for entry in package_imports(f"filter_service/{room}")
+        for name in FILTER_SUBPACKAGES
+        if name not in KNOW_MESSAGES
+        for entry in package_imports(f"filter_service/{name}")
         if _may(entry.module, ("filter_service.messages", "filter_service.wire"))
     ]
     assert not wrong, "\n".join(wrong)
 
 
-@pytest.mark.parametrize("package", ROOMS)
-def test_every_folder_is_a_room(package):
+@pytest.mark.parametrize("package", SUBPACKAGES)
+def test_every_folder_is_a_subpackage(package):
     folders = {path.parent.name for path in (ROOT / package).glob("*/__init__.py")}
     modules = {path.stem for path in (ROOT / package).glob("*.py")}
-    assert folders <= set(ROOMS[package]) <= folders | modules
+    assert folders <= set(SUBPACKAGES[package]) <= folders | modules
 
 
 def _graph():
@@ -378,17 +378,17 @@ def _packages():
 
 
 @pytest.mark.parametrize("folder", _packages(), ids=lambda p: str(p.relative_to(ROOT)))
-def test_every_room_lists_its_files_and_shows_what_it_says(folder):
+def test_every_package_lists_its_files(folder):
     name = ".".join(folder.relative_to(ROOT).parts)
     face = importlib.import_module(name)
     if folder.name == "scenes":
         return  # a handful of plain modules
     files = {p.stem for p in folder.glob("*.py")} - {"__init__", "__main__"}
-    rooms = {p.parent.name + "/" for p in folder.glob("*/__init__.py")}
+    subpackages = {p.parent.name + "/" for p in folder.glob("*/__init__.py")}
     text = (folder / "__init__.py").read_text(encoding="utf-8")
     listed = set(re.findall(r"^ *([\w./]+)  +\S", text, flags=re.MULTILINE))
     if name != "clients":  # its list names what to start with
-        assert files | rooms <= listed, sorted((files | rooms) - listed)
+        assert files | subpackages <= listed, sorted((files | subpackages) - listed)
     for entry in listed:
         path = folder / entry
         assert path.exists() or path.with_suffix(".py").is_file(), entry
