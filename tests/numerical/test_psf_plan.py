@@ -357,9 +357,10 @@ def test_two_planes_take_fewer_psfs_than_all_between_them():
     eye = traced_eye("emmetropia", spec)
     wide, split = (unchecked_plan(eye, own) for own in (spec, planes))
     assert split.prediction.psf_count < 0.4 * wide.prediction.psf_count
-    # 57 and 54 dB
-    found_db = [measured_db(eye, planes, plan, count=64) for plan in (wide, split)]
-    assert min(found_db) > 52.0
+    # 57 and 52.3 dB over all samples; the plan of two planes predicts 53.5
+    found_db = [measured_db(eye, planes, plan, count=256) for plan in (wide, split)]
+    assert found_db[0] > found_db[1]
+    assert found_db[1] == pytest.approx(split.prediction.interpolation_db, abs=3.0)
 
 
 def test_memory_is_predicted_for_the_cache_that_is_built():
