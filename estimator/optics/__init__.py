@@ -1,6 +1,5 @@
 """Surfaces, media, ray tracing, paraxial optics and Zernike polynomials.
 
-arrays            arrays in the form that compiled loops require
 units             unit conversions, reference wavelengths
 zernike           Zernike polynomials: indices, values, gradients, rescaling, mirroring
 zernike_orders    coefficients in the orders, normalizations and units of programs

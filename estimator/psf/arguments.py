@@ -9,13 +9,25 @@ from collections.abc import Collection
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from estimator.optics.arrays import broadcast_copy
 from estimator.optics.zernike import DEFAULT_ORDER, HIGHEST_ORDER
 from estimator.psf.pupil import ELLIPSE_COLUMNS
 
 TERM_COUNTS = tuple(
     (order + 1) * (order + 2) // 2 for order in range(DEFAULT_ORDER, HIGHEST_ORDER + 1)
 )
+
+
+def broadcast_copy(values: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.float64]:
+    """Return values broadcast to ``shape`` as a writable array in C order.
+
+    `numpy.broadcast_to` returns a view that is read-only and may repeat its elements.
+
+    Raises
+    ------
+    ValueError
+        The values do not broadcast to the shape.
+    """
+    return np.array(np.broadcast_to(values, shape), dtype=np.float64, order="C")
 
 
 def checked_zernike_um(zernike_um: ArrayLike) -> NDArray[np.float64]:

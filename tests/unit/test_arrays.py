@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from estimator.optics.arrays import broadcast_copy
+from estimator.psf.arguments import broadcast_copy
 
 
 @pytest.mark.parametrize("shape", [(), (2,), (1, 2), (3, 2), (3, 1)])
