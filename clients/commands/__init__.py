@@ -9,7 +9,8 @@ correct_image  correct: a picture solved for a viewer
 best_lens      best-lens: spectacles or a contact lens for a scene
 scenario       scenario: two states of one person
 eye            estimate and field: an eye and its visual field
-optics         wavefront and psf: an eye in one direction
+wavefront      wavefront: aberrations in one direction
+psf            psf: the point-spread function in one direction
 coefficients   coefficients in other orders, as wavefront and estimate print them
 eye_bank       bank: prebuilt eyes of many persons
 image_quality  mtf, acuity, refraction and through-focus: an eye in lists of states

@@ -12,7 +12,8 @@ from clients.commands.coefficients import (
     measured_facts,
     measurement_at,
 )
-from clients.commands.optics import (
+from clients.commands.state_options import EyeName, listed_numbers
+from clients.commands.wavefront import (
     FOCUS_LIMITS_DPT,
     PUPIL_LIMITS_MM,
     WAVELENGTH_LIMITS_NM,
@@ -20,7 +21,6 @@ from clients.commands.optics import (
     Wavelength,
     ellipse_facts,
 )
-from clients.commands.state_options import EyeName, listed_numbers
 from estimator.optics.units import REFERENCE_WAVELENGTH_NM
 from filter_service.command_line import (
     CommandFailed,

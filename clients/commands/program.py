@@ -74,7 +74,7 @@ COMMANDS = {
         "Estimate the eye that reproduces a measured wavefront.",
     ),
     "wavefront": (
-        "clients.commands.optics:wavefront",
+        "clients.commands.wavefront:wavefront",
         "Print the Zernike coefficients of an eye in one direction.",
     ),
     "field": (
@@ -82,7 +82,7 @@ COMMANDS = {
         "Print refraction and aberrations over the visual field.",
     ),
     "psf": (
-        "clients.commands.optics:psf",
+        "clients.commands.psf:psf",
         "Compute PSFs as arrays or images.",
     ),
     "mtf": (

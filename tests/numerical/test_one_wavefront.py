@@ -19,7 +19,7 @@ import json
 import numpy as np
 import pytest
 
-from clients.commands.optics import _state
+from clients.commands.psf import _state
 from estimator.estimate.model import eye_model
 from estimator.field.field_table import field_table
 from estimator.field.prepare import prepare_eye
