@@ -43,10 +43,10 @@ from filter_service.errors import FilterError
 from tests.benchmarks.harness import KeptRows, Row, Run
 from tests.benchmarks.rows import row_of
 
-MINUTES = 6
+MINUTES = 4
 SIZES_PX = ((448, 504), (896, 1007))
 QUICK_SIZES_PX = ((112, 126),)
-N_FRAMES, QUICK_FRAMES = 80, 5
+N_FRAMES, QUICK_FRAMES = 48, 5
 WARM_S = 60.0
 RATE_HZ = 72.0
 WAYS = ("here, textures", "here", "service, shm")
