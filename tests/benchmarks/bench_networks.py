@@ -34,10 +34,10 @@ from tests.benchmarks.harness import Row, Run, memory_mb, time_calls
 from tests.benchmarks.published_figures import CONDITIONS
 from tests.numerical.eye_cases import population_profiles, random_eye_profiles
 
-MINUTES = 6
-REPEATS, QUICK_REPEATS = 20, 3
+MINUTES = 4
+REPEATS, QUICK_REPEATS = 10, 3
 SEARCH_S, QUICK_SEARCH_S = 8.0, 1.0
-N_EYES, N_QUICK_EYES = {"random eyes": 1000, "population": 200}, 20
+N_EYES, N_QUICK_EYES = {"random eyes": 500, "population": 100}, 20
 QUICK_CONDITIONS = ("emmetropia", "keratoconus")
 SEED = 132
 STARTS = (("table",), ("network",), ("table", "network"))
