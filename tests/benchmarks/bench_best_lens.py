@@ -1,13 +1,13 @@
 """The lens that is best for a scene, and the best correction of the eye alone.
 
 Eyes of -2 dpt, with astigmatism, with keratoconus, after LASIK, and of 60 years look
-through 3 and 5 mm at letters and a photograph of scikit-image, far away, and at a
-courtyard with depth, relaxed; the last one also at letters and photographs both far
-away and at 0.4 m, through single-vision and progressive lenses.  The lens of the search
-is compared with the one of the highest visual Strehl ratio: error by the measure of the
-search, retinal PSNR, visual Strehl ratio and acuity for far objects.  A grid of 26
-lenses 0.1 dpt around the result (power vector at the pupil) shows whether it is a
-minimum.
+through 3 and 5 mm at letters and a photograph of scikit-image, far away; two of them at
+a courtyard with depth, relaxed; the last one also at letters and, through 5 mm, at the
+photograph both far away and at 0.4 m, through single-vision and progressive lenses.
+The lens of the search is compared with the one of the highest visual Strehl ratio:
+error by the measure of the search, retinal PSNR, visual Strehl ratio and acuity for far
+objects.  A grid of 26 lenses 0.1 dpt around the result (power vector at the pupil)
+shows whether it is a minimum.
 """
 
 from contextlib import ExitStack
@@ -50,8 +50,9 @@ EYES = {
     "post-LASIK": {"kind": "preset", "name": "post_lasik"},
     "60 years": prescription(0.0, age_years=60),
 }
-MINUTES = 10
+MINUTES = 4
 PUPILS_MM = 3.0, 5.0
+IN_COURTYARD = (("-2 dpt", 3.0), ("keratoconus", 5.0))
 COURTYARD_FOV_DEG, COURTYARD_MM, SKY_MM = 50.0, 1000.0, 65535
 NEAR_M, READING_DEG = 0.4, (0.0, -30.0)
 PROGRESSIVE = {"kind": "progressive", "vertex_mm": 12.0}
@@ -88,10 +89,13 @@ def cases(*, is_quick: bool):
             yield name, pupil_mm, f"{picture}, far", [scene], {}, ON_AXIS
         if is_quick:
             continue
-        scene = LensScene(view=courtyard(), pupil_diameter_mm=pupil_mm, focus_dpt=0.0)
-        yield name, pupil_mm, "courtyard", [scene], {}, {}
+        if (name, pupil_mm) in IN_COURTYARD:
+            scene = LensScene(
+                view=courtyard(), pupil_diameter_mm=pupil_mm, focus_dpt=0.0
+            )
+            yield name, pupil_mm, "courtyard", [scene], {}, {}
         if name == "60 years":
-            for picture in PICTURES:
+            for picture in PICTURES if pupil_mm == max(PUPILS_MM) else ["letters"]:
                 both = [
                     LensScene(view=chart(picture), pupil_diameter_mm=pupil_mm),
                     LensScene(
