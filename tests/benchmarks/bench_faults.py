@@ -38,12 +38,14 @@ from tests.benchmarks.harness import Row, Run
 from tests.benchmarks.rows import row_of
 from tests.benchmarks.service_stream import PROFILE, Stream, view_of
 
-MINUTES = 24
+MINUTES = 10
 CASES = ("overload", "sharing", "killed", "restart", "upgrade", "soak")
 RATE_HZ = 30.0
 TOO_FAST = 3.0
 N_ALONE = 12
-SETTLE_S, SETTLE_RESTART_S = 3.0, 12.0  # by then, a process that stands by is ready
+STREAM_S = 15.0
+SETTLE_S, SETTLE_STANDBY_S = 3.0, 12.0  # by then, a process that stands by is ready
+N_RESTARTS, N_UPGRADES, SOAK_MINUTES = 2, 2, 3.0
 UPGRADE_S = 3.0  # before the upgrade, and after the first frame of the new service
 
 STATIC = {
@@ -67,7 +69,7 @@ def options(parser) -> None:
 
 def overload_rows(quick: bool) -> list[Row]:
     """Submit on a schedule that is too fast."""
-    seconds, view, memory_mb = 8.0 if quick else 30.0, view_of((1280, 720)), []
+    seconds, view, memory_mb = 8.0 if quick else STREAM_S, view_of((1280, 720)), []
     with ServiceProcess() as service, Stream(service.endpoint, view) as stream:
         while len(stream.filtered()) < N_ALONE:
             time.sleep(0.05)
@@ -98,7 +100,7 @@ def overload_rows(quick: bool) -> list[Row]:
 
 def sharing_rows(quick: bool) -> list[Row]:
     """Let two clients stream beside each other; return a row for each."""
-    seconds, large = (8.0, (2048, 2048)) if quick else (30.0, (4096, 4096))
+    seconds, large = (8.0, (2048, 2048)) if quick else (STREAM_S, (4096, 4096))
     pairs = (
         (("a flood", (640, 360), 2), ("one", (640, 360), 1)),
         (("720p", (1280, 720), 2), ("180p", (320, 180), 2)),
@@ -208,8 +210,9 @@ def restart_rows(quick: bool) -> list[Row]:
             ):
                 stream.wait_for(lambda one: one.is_complete)
                 before = stream.last.color.astype(np.float32)
-                for _ in range(1 if quick else 4):
-                    time.sleep(SETTLE_S if quick else SETTLE_RESTART_S)
+                for _ in range(1 if quick else N_RESTARTS):
+                    is_standby = settings.get("standby", False)
+                    time.sleep(SETTLE_STANDBY_S if is_standby else SETTLE_S)
                     os.kill(service.pids()["render"], signal.SIGKILL)
                     killed_s = time.monotonic()
                     for times_ms, is_whole in ((first_ms, False), (whole_ms, True)):
@@ -288,7 +291,7 @@ def upgrade_rows(quick: bool, old: str | None) -> tuple[list[Row], list[dict]]:
                 settings = on_disk if case == "eyes on disk" else {}
                 found = [
                     upgraded(command, settings, method == "filter calls")
-                    for _ in range(1 if quick else 3)
+                    for _ in range(1 if quick else N_UPGRADES)
                 ]
             runs += [{"method": method, "case": case, **one} for one in found]
             rows.append(
@@ -316,7 +319,7 @@ def process_counts(pid: int) -> dict[str, float]:
 
 def soak_rows(quick: bool) -> list[Row]:
     """Stream for minutes; return a row for each thing that is sampled."""
-    minutes, samples = 0.5 if quick else 10.0, defaultdict(list)
+    minutes, samples = 0.5 if quick else SOAK_MINUTES, defaultdict(list)
     spheres = iter(np.tile(np.random.default_rng(0).permutation(SPHERES_DPT), 999))
     counts, view = Counter(), view_of(SOAK_SIZE_PX)
     due_s = [time.monotonic() + PROFILE_S]
