@@ -44,7 +44,7 @@ from tests.benchmarks.harness import OUT, ROOT, Row, Run
 from tests.benchmarks.rows import row_of
 from tests.numerical.synthetic import psnr_db
 
-MINUTES = 15
+MINUTES = 8
 SOURCES = tuple(
     Path(__file__).with_name(name) for name in ("witness_script.py", "witness_eye.py")
 )
@@ -72,17 +72,9 @@ class Case:
 
 
 EMMETROPE = {"kind": "prescription", "sphere_dpt": 0.0, "higher_order": "none"}
-ASTIGMAT = {
-    "kind": "prescription",
-    "sphere_dpt": -1.0,
-    "cylinder_dpt": -2.0,
-    "axis_deg": 30.0,
-}
 CASES = (
     Case("plane at 2 dpt, looks far", "plane", EMMETROPE, 0.0),
     Case("room, looks far", "room", EMMETROPE, 0.0),
-    Case("room, looks at 2.5 dpt", "room", EMMETROPE, 2.5),
-    Case("room, astigmatism", "room", ASTIGMAT, 1.0),
     Case("room, keratoconus", "room", {"kind": "preset", "name": "keratoconus"}, 1.0),
 )
 
