@@ -55,7 +55,7 @@ from tests.benchmarks.peer_process import peer_versions
 from tests.isetbio_psfs import moved_light, our_psf, published_psfs
 from tests.numerical.scene_frames import scene_view
 
-MINUTES = 12
+MINUTES = 8
 STATE = {"pupil_diameter_mm": 5.0, "focus_dpt": 0.5}
 EYES = {
     "-6 dpt": {"kind": "prescription", "sphere_dpt": -6.0, "higher_order": "none"},
@@ -64,7 +64,7 @@ EYES = {
 DISC_CASE = "-6 dpt, disc"
 DISC_SETTINGS = {"chromatic": False, "diffraction": False}
 SIZE, FLAT_SIZE, QUICK_SIZE = (1280, 720), (640, 360), (320, 180)
-REPEATS, QUICK_REPEATS = 5, 3
+REPEATS = 3
 
 SLOW_MS = 5000.0
 """A method whose warm-up takes longer runs once in a new state and once in the same."""
@@ -317,16 +317,15 @@ def layer_rows(*, is_quick: bool) -> Iterator[PeerRow]:
     view = scene_view("courtyard", width_px=width_px, height_px=height_px)
     disc = Problem(view, EYES["-6 dpt"], DISC_SETTINGS)
     cases = [(case, Problem(view, profile), PEERS) for case, profile in EYES.items()]
-    repeats = QUICK_REPEATS if is_quick else REPEATS
     for case, problem, peers in (*cases, (DISC_CASE, disc, DISC_PEERS)):
-        yield from peer_rows(problem, case, [*our_peers(), *peers], repeats)
+        yield from peer_rows(problem, case, [*our_peers(), *peers], REPEATS)
 
 
 def field_rows(*, is_quick: bool) -> Iterator[PeerRow]:
     """Return rows of a flat picture over the visual field."""
     width_px, height_px = QUICK_SIZE if is_quick else FLAT_SIZE
     view = scene_view("courtyard", width_px=width_px, height_px=height_px)
-    return flat_rows(view, QUICK_REPEATS if is_quick else REPEATS)
+    return flat_rows(view, REPEATS)
 
 
 KINDS = {
