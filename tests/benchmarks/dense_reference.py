@@ -47,7 +47,13 @@ BATCH_PSF_COUNT = 9000
 """PSFs held at a time: 250 MB of them at a radius of 40 px."""
 
 WINDOW_REACH_PX = 112
-"""Pixels taken in about a window: no PSF may reach farther."""
+"""Pixels taken in about a window at most: no PSF may reach farther."""
+
+PROBE_STEP = 50
+"""One source of so many, near to far, tells how far PSFs reach."""
+
+PROBE_MARGIN = 1.25
+PROBE_MARGIN_PX = 4
 
 CACHE = Path(__file__).parents[2] / "out" / "dense_references"
 
@@ -120,21 +126,35 @@ def _filtered(
 ) -> NDArray[np.float64]:
     sources = view_sources(view, state.spec)
     order = sources.near_first()
-    if window is not None:
-        away_px = window.distance_px(*np.divmod(order, view.width_px))
-        order = order[away_px <= WINDOW_REACH_PX]
     places = binned(sources) if bins else sources
     # A place is one PSF, however many pixels share it.
     places = np.stack([places.h_deg, places.v_deg, places.distance_dpt], axis=-1)
-    places = places[order]
+    if window is None:
+        sums, _ = _sums(view, state, sources, order, places, accumulation)
+        return sums.picture(linear_color(view))
+    away_px = window.distance_px(*np.divmod(order, view.width_px))
+    order, away_px = (a[away_px <= WINDOW_REACH_PX] for a in (order, away_px))
+    probe = state.exact_psfs(*places[order[::PROBE_STEP]].T)
+    probed_px = PROBE_MARGIN * probe.radius_px.max() + PROBE_MARGIN_PX
+    for reach_px in (min(probed_px, WINDOW_REACH_PX), WINDOW_REACH_PX):
+        near = order[away_px <= reach_px]
+        sums, radius_px = _sums(view, state, sources, near, places, accumulation)
+        if radius_px <= reach_px:
+            return window.of(sums.picture(linear_color(view)))
+    raise ValueError(
+        f"a PSF reaches {radius_px} px; windows take in {WINDOW_REACH_PX} px about them"
+    )
+
+
+def _sums(
+    view: RgbdView, state: EyeState, sources, order, places: NDArray, accumulation: str
+) -> tuple["DepthSums", int]:
+    """Return the sums of sources in an order, and the largest radius of their PSFs."""
     sums = DepthSums(view.depth_m.shape, accumulation, depth_step_dpt(state))
-    for part, found, place_of in _batches(places):
+    radius_px = 0
+    for part, found, place_of in _batches(places[order]):
         psfs = state.exact_psfs(*found.T)
-        if window is not None and psfs.radius_px.max() > WINDOW_REACH_PX:
-            raise ValueError(
-                f"a PSF reaches {psfs.radius_px.max()} px; windows take in "
-                f"{WINDOW_REACH_PX} px about them"
-            )
+        radius_px = max(radius_px, int(psfs.radius_px.max()))
         for pixel, place in zip(order[part], place_of, strict=True):
             sums.add(
                 *divmod(pixel, view.width_px),
@@ -142,8 +162,7 @@ def _filtered(
                 sources.color[pixel],
                 _of_three(psfs, place),
             )
-    picture = sums.picture(linear_color(view))
-    return picture if window is None else window.of(picture)
+    return sums, radius_px
 
 
 ACCUMULATIONS = ("coverage", "paper", "sum")
