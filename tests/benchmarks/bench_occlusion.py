@@ -33,7 +33,7 @@ from tests.reference.lens_picture import (
     lens_picture,
 )
 
-MINUTES = 12
+MINUTES = 3
 EYE = {"kind": "prescription", "sphere_dpt": 0.0}
 ONE_LAYER = {"hidden_color": None, "hidden_depth_m": None}
 METHODS = {
