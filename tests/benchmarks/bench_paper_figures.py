@@ -26,7 +26,7 @@ from tests.benchmarks.image_measures import channel_psnr_db
 from tests.benchmarks.view_sources import Window
 from tests.numerical.scene_frames import scene_view
 
-MINUTES = 12
+MINUTES = 6
 SIZE, QUICK_SIZE = (640, 360), (320, 180)
 STATE = State(5.0, 0.5)
 CELL_PX = (240, 135)

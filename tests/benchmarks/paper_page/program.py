@@ -4,8 +4,8 @@
 
 Without options from the committed results, in seconds.  With --fresh the benchmarks run
 first and the page says so; --quick takes few cases of each, at small sizes.  Results of
-a fresh run go to a folder of their own.  What needs another machine, an hour
-(live.json), or the training, stays as committed.
+a fresh run go to a folder of their own.  What needs another machine, a
+stream (live.json), or the training, stays as committed.
 """
 
 import argparse
@@ -28,9 +28,9 @@ RUNS = {
     "paper_layouts": (0.2, 0.2),
     "layers": (4.0, 1.0),
     "networks": (6.0, 0.5),
-    "published": (8.0, 2.0),
-    "paper_figures": (12.0, 1.0),
-    "field": (90.0, 1.5),
+    "published": (5.0, 2.0),
+    "paper_figures": (6.0, 1.0),
+    "field": (22.0, 1.5),
 }
 
 
