@@ -36,7 +36,7 @@ from tests.grid_specs import grid_spec
 from tests.numerical.plan_cases import traced_eye
 from tests.numerical.synthetic import psnr_db
 
-MINUTES = 80
+MINUTES = 14
 SIZES = ((480, 270), (1280, 720))
 PATH = path_settings("courtyard")
 WARM_UPS = 2
@@ -88,19 +88,17 @@ def exact_pixels(moment: Moment, eye: str, windows: Sequence[Window]) -> NDArray
     )
 
 
-def ways(gl) -> Iterator[tuple[str, object, float, int | None]]:
-    """Yield names, renderers, tolerances and numbers of frames.
+def ways(gl) -> Iterator[tuple[str, object, int | None]]:
+    """Yield names, renderers and numbers of frames.
 
     They are OpenGL, if it is there, and the native engine on one and two cores.
     """
     if gl is not None:
         few = SOFTWARE_GL_FRAMES if is_software_renderer(gl.name) else None
-        yield "GL", gl, 1.0, few
+        yield "GL", gl, few
     for n_threads, name in ((1, "1 core"), (2, "2 cores")):
         renderer = NativeRenderer(n_threads=n_threads)
-        yield name, renderer, 1.0, None
-        for tolerance in (1.4, 2.0) if n_threads == 2 else ():
-            yield f"{name}, tolerance {tolerance:g}", renderer, tolerance, None
+        yield name, renderer, None
         renderer.close()
 
 
@@ -115,13 +113,11 @@ def eye_rows(eye: str, walk: Sequence[Moment], gl) -> list[Row]:
     if len(windows) > 1:
         reference += f", three windows of {WINDOW_PX} x {WINDOW_PX} px"
     rows: list[Row] = []
-    for name, renderer, tolerance, count in ways(gl):
+    for name, renderer, count in ways(gl):
         handle = renderer.load(store)
 
-        def frame(
-            moment, output, renderer=renderer, handle=handle, tolerance=tolerance
-        ):
-            options = moment.state | {"output": output, "render_tolerance": tolerance}
+        def frame(moment, output, renderer=renderer, handle=handle):
+            options = moment.state | {"output": output}
             return renderer.render(moment.view, handle, **options)
 
         seen = frame(judged, "linear").color
