@@ -28,7 +28,7 @@ from filter_service.rgbd_view import RgbdView
 from tests.benchmarks.harness import Row, Run, memory_mb
 from tests.benchmarks.wiener_pictures import by_one_psf, by_tiles, log_mar_of_picture
 
-MINUTES = 6
+MINUTES = 3
 
 
 def prescription(sphere_dpt: float, **more) -> dict:
