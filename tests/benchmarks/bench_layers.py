@@ -22,7 +22,7 @@ from tests.numerical.plan_cases import spec_for, traced_eye
 from tests.numerical.scene_frames import scene_view
 from tests.numerical.synthetic import psnr_db
 
-MINUTES = 3
+MINUTES = 2
 SIZE = {"width_px": 1280, "height_px": 720, "object_range_dpt": (0.0, 8.0)}
 PUPIL_MM, FOCUS_DPT = 5.0, 0.5
 STATE = {"pupil_diameter_mm": PUPIL_MM, "focus_dpt": FOCUS_DPT}
