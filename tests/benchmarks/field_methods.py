@@ -199,21 +199,18 @@ def _counted(name, *arguments, **options) -> Baseline:
     return Baseline(name, *arguments, **options, timed=False)
 
 
-PAPER_RULE = (("rule", "paper"),)
 METHODS = (
     Ours("ours on-axis", on_axis=True, any_state=False, mode="on-axis"),
     Ours("ours on-axis wide", on_axis=True, any_state=True, mode="on-axis"),
     Ours("ours quality", on_axis=False, any_state=False, mode="quality"),
     Ours("ours dynamic", on_axis=False, any_state=True),
     Ours("ours dynamic fine", on_axis=False, any_state=True, tolerance="fine"),
-    Ours("ours paper grid", on_axis=False, any_state=True, grid="paper"),
     Baseline("Barsky", True, False, barsky),
     Baseline("Celaya", False, False, celaya),
     Baseline("Gonzalez", False, False, gonzalez),
     _counted("predecessor", True, False, predecessor),
     _counted("paper on-axis", True, False, paper_on_axis),
-    _counted("paper alpha 1 tap", True, False, paper_on_axis, PAPER_RULE),
+    _counted("paper alpha 1 tap", True, False, paper_on_axis, (("rule", "paper"),)),
     _counted("paper quality", False, False, paper_quality, (), True),
-    _counted("paper alpha 4 tap", False, False, paper_quality, PAPER_RULE, True),
     _counted("paper dynamic", False, True, paper_dynamic, (), True),
 )

@@ -27,10 +27,6 @@ from tests.benchmarks.paper_layout import (
 from tests.benchmarks.resized_psfs import full_radius_px, resized
 from tests.benchmarks.view_sources import EyeState, Sources, linear_color, view_sources
 
-RULES = ("coverage", "paper")
-"""How sources add up: those of one depth share what nearer ones leave free, or a weight
-is an opacity."""
-
 PREDECESSOR_TAPS = 6
 ON_AXIS_TAPS = 1
 OFF_AXIS_TAPS = 4
@@ -40,11 +36,7 @@ DYNAMIC_FOCI_DPT = 0.125 + np.arange(5.0)
 
 
 def predecessor(
-    view: RgbdView,
-    state: EyeState,
-    *,
-    grid: PaperGrid = ON_AXIS,
-    rule: str = "coverage",
+    view: RgbdView, state: EyeState, *, grid: PaperGrid = ON_AXIS
 ) -> Filtered:
     """Stack of every PSF at every blur radius: six samples a chromatic value.
 
@@ -82,7 +74,6 @@ def predecessor(
         np.stack(layers, axis=-1),
         np.stack(weights, axis=-1),
         np.ceil(own_px.max(axis=1) - 1e-9),
-        rule,
     )
     return Filtered(
         color=color,
@@ -99,7 +90,8 @@ def paper_on_axis(
 ) -> Filtered:
     """Layers by distance with transitional ones between: one sample (Eq. 8, 6.1-6.2).
 
-    33 distances; pupil and focus are the frame's, not between nodes.
+    33 distances; pupil and focus are the frame's, not between nodes.  By the rule
+    "paper", a weight is an opacity.
 
     References
     ----------
@@ -109,11 +101,7 @@ def paper_on_axis(
 
 
 def paper_quality(
-    view: RgbdView,
-    state: EyeState,
-    *,
-    grid: PaperGrid = QUALITY,
-    rule: str = "coverage",
+    view: RgbdView, state: EyeState, *, grid: PaperGrid = QUALITY
 ) -> Filtered:
     """Blocks of layers by direction, 31 x 21 x 9 and transitional ones: four samples.
 
@@ -121,15 +109,11 @@ def paper_quality(
     ----------
     Csoba & Kunkli 2023, section 6.3 (Eqs. 9 to 13, s = 1, p = 1/2) and 7.2.2.
     """
-    return _from_texture(view, state, grid, OFF_AXIS_TAPS, rule)
+    return _from_texture(view, state, grid, OFF_AXIS_TAPS)
 
 
 def paper_dynamic(
-    view: RgbdView,
-    state: EyeState,
-    *,
-    grid: PaperGrid = DYNAMIC,
-    rule: str = "coverage",
+    view: RgbdView, state: EyeState, *, grid: PaperGrid = DYNAMIC
 ) -> Filtered:
     """Blocks of 23 x 13 x 9 PSFs without transitional layers, blended over the state.
 
@@ -159,7 +143,7 @@ def paper_dynamic(
     radius_px = np.max([texture.radius_px for _, texture in corners], axis=0)
     texture = replace(first, weights=blended, radius_px=radius_px)
     states = DYNAMIC_PUPILS_MM.size * DYNAMIC_FOCI_DPT.size
-    color, evaluations = _splat_texture(view, state, texture, rule)
+    color, evaluations = _splat_texture(view, state, texture)
     return Filtered(
         color=color,
         prepare_ms=prepare_ms,
@@ -170,7 +154,7 @@ def paper_dynamic(
     )
 
 
-def _from_texture(view, state, grid, taps, rule) -> Filtered:
+def _from_texture(view, state, grid, taps, rule="coverage") -> Filtered:
     texture, prepare_ms = kept_texture(state, grid)
     watch = Stopwatch()
     color, evaluations = _splat_texture(view, state, texture, rule)
@@ -191,7 +175,7 @@ def _ends(nodes: NDArray, value: float) -> list[tuple[float, float]]:
 
 
 def _splat_texture(
-    view: RgbdView, state: EyeState, texture: PaperTexture, rule: str
+    view: RgbdView, state: EyeState, texture: PaperTexture, rule: str = "coverage"
 ) -> tuple[NDArray, int]:
     """Splat every pixel with two layers of each of the blocks around its direction."""
     sources = view_sources(view, state.spec)
@@ -238,7 +222,7 @@ def splat_sources(
     layers: NDArray,
     weights: NDArray,
     radius_px: NDArray,
-    rule: str,
+    rule: str = "coverage",
 ) -> tuple[NDArray, int]:
     """Splat sources near to far; image, and how many PSF values were made."""
     height, width, full = view.height_px, view.width_px, texture.shape[2] // 2

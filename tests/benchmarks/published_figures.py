@@ -1,6 +1,4 @@
-"""The eyes of the published tables (Csoba & Kunkli 2023), and their hardware."""
-
-HARDWARE = "NVIDIA TITAN Xp"
+"""The eyes of the published tables (Csoba & Kunkli 2023)."""
 
 CONDITIONS = (
     "emmetropia",
