@@ -4,8 +4,7 @@ The courtyard at 480x270 and 1280x720 through six eyes, in a constant state.  Th
 without merging, the operator and its adjoint take turns, after the first call of each.
 The error of the operator is its largest difference from the frame, relative to the
 brightest pixel; that of the adjoint is the difference of <A x, y> and <x, A' y>,
-relative to them, for random x and y from 0 to 1.  Below, the times of processors (all
-threads) and the ratios of medians.
+relative to them, for random x and y from 0 to 1.
 """
 
 import time
@@ -24,8 +23,9 @@ from filter_service.rendering.media_effects import linear_from_srgb
 from filter_service.rendering.native import NativeRenderer
 from filter_service.rgbd_view import RgbdView
 from filter_service.view_state import State
-from tests.benchmarks.harness import WARM_UPS, Row, Run, memory_mb
+from tests.benchmarks.harness import WARM_UPS, Row, Run
 from tests.benchmarks.published_figures import CONDITIONS
+from tests.benchmarks.rows import row_of
 from tests.grid_specs import grid_spec
 from tests.numerical.scene_frames import scene_view
 
@@ -33,7 +33,6 @@ MINUTES = 2
 SIZES, QUICK_SIZES = ((480, 270), (1280, 720)), ((240, 135),)
 COUNTS, QUICK_COUNT = (30, 12), 5
 STATE = State(4.5, 0.5)
-METHODS = ("frame", "forward", "adjoint")
 
 
 def linear_view(size_px: tuple[int, int]) -> RgbdView:
@@ -50,22 +49,18 @@ def inner(first: NDArray, second: NDArray) -> float:
 def times_in_turns(
     calls: dict[str, Callable[[], object]], count: int
 ) -> dict[str, NDArray[np.float64]]:
-    """Return wall and processor times (count, 2), ms, of calls that take turns."""
-    found: dict[str, list[tuple[float, float]]] = {name: [] for name in calls}
-    for k in range(WARM_UPS + count):
+    """Return the times (count,), ms, of calls that take turns."""
+    found: dict[str, list[float]] = {name: [] for name in calls}
+    for _ in range(WARM_UPS + count):
         for name, call in calls.items():
-            wall_s, own_s = time.perf_counter(), time.process_time()
+            start_s = time.perf_counter()
             call()
-            elapsed_s = time.perf_counter() - wall_s, time.process_time() - own_s
-            if k >= WARM_UPS:
-                found[name].append(elapsed_s)
-    return {name: 1e3 * np.array(values) for name, values in found.items()}
+            found[name].append(time.perf_counter() - start_s)
+    return {name: 1e3 * np.array(times_s[WARM_UPS:]) for name, times_s in found.items()}
 
 
-def rows_of(
-    view: RgbdView, name: str, count: int, ratios: list[dict[str, object]]
-) -> Iterator[Row]:
-    """Rows of one eye; appends the ratios of its times."""
+def rows_of(view: RgbdView, name: str, count: int) -> Iterator[Row]:
+    """Yield the rows of one eye."""
     profile = parse_profile({"kind": "preset", "name": name})
     spec = grid_spec(
         view.camera,
@@ -91,7 +86,7 @@ def rows_of(
     def adjoint() -> None:
         found["adjoint"] = operator.adjoint(y)
 
-    calls = dict(zip(METHODS, (frame, forward, adjoint), strict=True))
+    calls = {"frame": frame, "forward": forward, "adjoint": adjoint}
     times_ms = times_in_turns(calls, count)
     engine.close()
     product = inner(operator.forward(x), y)
@@ -110,41 +105,18 @@ def rows_of(
         ),
     }
     setting = f"{view.width_px}x{view.height_px}"
-    for method in METHODS:
-        wall_ms = times_ms[method][:, 0]
-        yield Row(
-            *("operator", method, name, setting, count),
-            *(float(np.median(wall_ms)), float(np.percentile(wall_ms, 95))),
-            *(memory_mb(), *errors[method]),
-        )
-    middle = {method: np.median(times_ms[method], axis=0) for method in METHODS}
-    ratio, adjoint_ratio = (
-        middle["forward"] / middle["frame"],
-        middle["adjoint"] / middle["forward"],
-    )
-    ratios.append(
-        {
-            "case": name,
-            "setting": setting,
-            **{f"{m}_cpu_ms": round(float(middle[m][1]), 2) for m in METHODS},
-            "forward_over_frame": round(float(ratio[0]), 3),
-            "forward_over_frame_cpu": round(float(ratio[1]), 3),
-            "adjoint_over_forward": round(float(adjoint_ratio[0]), 3),
-            "adjoint_over_forward_cpu": round(float(adjoint_ratio[1]), 3),
-        }
-    )
+    for method, of_method_ms in times_ms.items():
+        yield row_of("operator", method, name, setting, of_method_ms, *errors[method])
 
 
-def measure(run: Run) -> tuple[list[Row], dict[str, list[dict]]]:
-    """Return rows, and ratios of times."""
+def measure(run: Run) -> list[Row]:
+    """Return the rows of all eyes and sizes, or of one."""
     sizes, counts, eyes = SIZES, COUNTS, CONDITIONS
     if run.is_quick:
         sizes, counts, eyes = QUICK_SIZES, (QUICK_COUNT,), CONDITIONS[:1]
-    ratios: list[dict] = []
-    rows = [
+    return [
         row
         for size_px, count in zip(sizes, counts, strict=True)
         for name in eyes
-        for row in rows_of(linear_view(size_px), name, count, ratios)
+        for row in rows_of(linear_view(size_px), name, count)
     ]
-    return rows, {"ratios": ratios}
