@@ -35,9 +35,7 @@ DYNAMIC_PUPILS_MM = np.arange(2.0, 7.0)
 DYNAMIC_FOCI_DPT = 0.125 + np.arange(5.0)
 
 
-def predecessor(
-    view: RgbdView, state: EyeState, *, grid: PaperGrid = ON_AXIS
-) -> Filtered:
+def predecessor(view: RgbdView, state: EyeState) -> Filtered:
     """Stack of every PSF at every blur radius: six samples a chromatic value.
 
     Each channel has its own blur radius, interpolated over distance, and reads the two
@@ -49,14 +47,16 @@ def predecessor(
     layers, Table 6.
     """
     watch = Stopwatch()
-    cut = grid.precomputed(state)
+    cut = ON_AXIS.precomputed(state)
     radius = full_radius_px(cut.radius_px) + 1
-    psfs = resized(cut, np.zeros(cut.sides.size), np.full(cut.sides.size, radius))
+    kernels, starts = resized(
+        cut, np.zeros(cut.sides.size), np.full(cut.sides.size, radius)
+    )
     radii_px = cut.radius_px.reshape(-1, 3)
-    stack = _padded_stack(psfs.flat_kernels, psfs.starts, radius)
+    stack = _padded_stack(kernels, starts, radius)
     prepare_ms = watch.lap_ms()
     sources = view_sources(view, state.spec)
-    lower, upper, part = bracket_axis(grid.distance_dpt, sources.distance_dpt)
+    lower, upper, part = bracket_axis(ON_AXIS.distance_dpt, sources.distance_dpt)
     part = part[:, None]
     own_px = (1.0 - part) * radii_px[lower] + part * radii_px[upper]
     whole = np.minimum(own_px.astype(np.int64), radius - 1)

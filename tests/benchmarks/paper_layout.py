@@ -176,11 +176,11 @@ def paper_texture(state: EyeState, grid: PaperGrid) -> PaperTexture:
         for a, nodes in enumerate((grid.v_deg, grid.h_deg, grid.distance_dpt))
     ]
     first_px, last_px = _neighbour_radii(radii)
-    psfs = resized(cut, first_px.ravel(), last_px.ravel())
+    kernels, starts = resized(cut, first_px.ravel(), last_px.ravel())
     shape = tuple(axis.count for axis in axes)
     radius = full_radius_px(radii)
     nodes, shares = _corners(axes, grid.shape)
-    first_px, starts = first_px.reshape(-1, 3), psfs.starts.reshape(-1, 3)
+    first_px, starts = first_px.reshape(-1, 3), starts.reshape(-1, 3)
     # (layers, channels): the interpolated radius
     radius_px = np.einsum("lk,lkc->lc", shares, radii.reshape(-1, 3)[nodes])
     weights = np.zeros((math.prod(shape), 3, 2 * radius + 1, 2 * radius + 1), "f4")
@@ -196,7 +196,7 @@ def paper_texture(state: EyeState, grid: PaperGrid) -> PaperTexture:
                     continue
                 at = starts[node, channel] + squares_below(r)
                 at -= squares_below(first_px[node, channel])
-                kernel = psfs.flat_kernels[at : at + (2 * r + 1) ** 2]
+                kernel = kernels[at : at + (2 * r + 1) ** 2]
                 inner = slice(radius - r, radius + r + 1)
                 weights[layer, channel, inner, inner] += scale * kernel.reshape(
                     2 * r + 1, 2 * r + 1

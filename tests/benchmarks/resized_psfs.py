@@ -41,24 +41,6 @@ class CutPsfs:
     radius_px: NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class ResizedPsfs:
-    """Kernels (2R+1)² of P PSFs for all whole radii from ``first_px`` on.
-
-    Attributes
-    ----------
-    flat_kernels : (total,) float32
-    starts : (P,)
-        Of the kernel of ``first_px``; the others follow it.
-    first_px, last_px : (P,)
-    """
-
-    flat_kernels: NDArray[np.float32]
-    starts: NDArray[np.int64]
-    first_px: NDArray[np.int64]
-    last_px: NDArray[np.int64]
-
-
 def cut_psfs(
     state: EyeState, h_deg: NDArray, v_deg: NDArray, distance_dpt: NDArray
 ) -> CutPsfs:
@@ -108,8 +90,18 @@ def _cut(batch: PsfBatch) -> tuple[NDArray, NDArray]:
     return np.concatenate(sums), np.array(sides)
 
 
-def resized(cut: CutPsfs, first_px: NDArray, last_px: NDArray) -> ResizedPsfs:
-    """Resample each PSF to its whole radii first..last, by area."""
+def resized(
+    cut: CutPsfs, first_px: NDArray, last_px: NDArray
+) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+    """Resample each PSF to its whole radii first..last, by area.
+
+    Returns
+    -------
+    flat_kernels : (total,) float32
+        Kernels (2R+1)² of all radii of a PSF, one after the other.
+    starts : (P,)
+        Of the first kernel of each PSF.
+    """
     first_px, last_px = first_px.astype(np.int64), last_px.astype(np.int64)
     sizes = squares_below(last_px + 1) - squares_below(first_px)
     starts = np.cumsum(sizes) - sizes
@@ -122,7 +114,7 @@ def resized(cut: CutPsfs, first_px: NDArray, last_px: NDArray) -> ResizedPsfs:
             kernel = flat[to : to + width**2].reshape(width, width)
             kernel[:] = _light_in_cells(sums, width)
             to += width**2
-    return ResizedPsfs(flat, starts, first_px, last_px)
+    return flat, starts
 
 
 def squares_below(radius):
