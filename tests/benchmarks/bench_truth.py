@@ -10,8 +10,8 @@ row says otherwise.
   gray, they are not, and frames are divided by their coverage, so that a uniform image
   stays uniform.
 - energy: largest difference of a point's light in the frame from 1.
-- continuity: least ratio of the changes of a frame while the change of its input is
-  halved, down to changes of light of 1e-4; 2 if frames are continuous.
+- continuity, of three eyes: least ratio of the changes of a frame while the change of
+  its input is halved, down to changes of light of 1e-4; 2 if frames are continuous.
 - edge: largest difference of a lamp's light in a frame, 1 to 6 px beside a black edge
   in focus, from the share of its image that does not fall on the nearer surface, in
   green, for which the edge is in focus; and from the share of the pupil's rays to the
@@ -45,6 +45,7 @@ METHODS = {
     "quality": ({"mode": "quality"}, 0.015),
     "quality fine": ({"mode": "quality", "tolerance": "fine"}, 0.005),
 }
+CHANGED_EYES = ("emmetropia", "myopia", "keratoconus")
 ENERGY_GOAL, RATIO_GOAL, EDGE_GOAL = 0.002, 1.8, 0.02
 REFERENCE = "float64 quadrature"
 ENGINE = "native"
@@ -137,6 +138,7 @@ def measure(run: Run) -> list[Row]:
             return rows
         for eye in CONDITIONS:
             rows += point_rows(truth, eye, METHODS, len(STATES))
+        for eye in CHANGED_EYES:
             rows += change_rows(eye, "courtyard", tuple(truth_changes.STEPS))
         rows += change_rows("emmetropia", "photograph", ("depth noise", "pupil"))
         for eye in truth_edges.EDGES_DPT:
