@@ -23,7 +23,13 @@ def plain_text(before: EyeFacts, after: EyeFacts) -> str:
         sentences.append(f"{facts.label}: predicted acuity {', '.join(read)}.")
     if before.notation == "decimal":
         sentences.append("1.00 is 20/20 or 6/6.")
-    return " ".join([*sentences, _difference_text(before, after)])
+    sentences.append(_difference_text(before, after))
+    if any(facts.study.profile.straylight is not None for facts in (before, after)):
+        sentences.append(
+            "These acuities leave out scattered light, so they do not show how much "
+            "haze an eye has or loses; the letter charts do."
+        )
+    return " ".join(filter(None, sentences))
 
 
 def _where(distance_m: float) -> str:

@@ -101,6 +101,8 @@ YELLOWINGS: dict[Yellowing, str] = {
 YOUNG_YEARS = 25.0
 """Age of the eye to which straylight is compared."""
 
+GONE = "The cataract is gone with the natural lens; this is usual at this age. "
+
 CATARACT = "cataract"
 """Preset that has the haze of a cataract when it is selected."""
 DESIGNS = {
@@ -419,7 +421,8 @@ class EyeForm:
         log_s = haze.age_log_s if haze.log_s is None else haze.log_s
         young = replace(haze, age_years=YOUNG_YEARS).age_log_s
         by_age = 10.0 ** (log_s - haze.age_log_s)
-        return (
+        is_cataract = self.haze not in ("none", "age", "measured")
+        return GONE * (is_cataract and haze.log_s is None) + (
             f"{100.0 * haze.fraction:.0f} % of the light is scattered over the scene: "
             f"{10.0 ** (log_s - young):.1f} times as much as in a young eye, and "
             f"{by_age:.1f} times as much as is usual at this age (log s {log_s:.2f} "

@@ -33,6 +33,7 @@ FOCUS_CODES = (
 
 IMPLANT_FOCUS = "The implant cannot change its focus."
 WITHOUT_HAZE = "straylight is not included"
+LENSLETS = "The acuity through lenslets is not predicted."
 
 
 def sight_numbers(
@@ -107,7 +108,7 @@ def eye_sentences(
     of_focus = [note for note in notes if getattr(note, "code", "") in FOCUS_CODES]
     sentence, others = "", [note for note in notes if note not in of_focus]
     if sight is not None and math.isnan(sight["log_mar"]):
-        others = [*notes]
+        sentence, others = LENSLETS, [*notes]
     elif sight is not None:
         worn = profile.get("correction") or {}
         reasons = [*map(_sentence, of_focus)]

@@ -116,7 +116,9 @@ def test_the_cataract_has_haze_and_says_how_much():
     )
     form.wears_correction = True
     form.choose_worn("iol")
-    assert "1.0 times as much as is usual" in form.haze_text(age_years=AGE)
+    text = form.haze_text(age_years=AGE)
+    assert text.startswith("The cataract is gone with the natural lens; ")
+    assert "1.0 times as much as is usual" in text
     form.choose_preset("myopia")
     assert (form.haze, form.yellowing) == ("none", "none")
 

@@ -75,7 +75,9 @@ def test_nothing_is_said_of_the_focus_until_the_acuity_is_known():
     assert shown == "Pupil 7 mm capped at the measured 6 mm."
     unknown = {"log_mar": math.nan, "readable_dpt": None}  # through lenslets
     shown = eye_sentences(unknown, [note], {}, **state)
-    assert shown == "The eye lacks 2 dpt for 40 cm."
+    assert shown == (
+        "The acuity through lenslets is not predicted. The eye lacks 2 dpt for 40 cm."
+    )
     blurred = {"log_mar": math.inf, "readable_dpt": None}
     shown = eye_sentences(blurred, [], {"straylight": {}}, **state)
     assert shown == (
