@@ -140,7 +140,8 @@ def kinds(folder: Path) -> list[Kind]:
     from clients.commands.options import display_of_file
     from clients.headset.gltf_scene import load_gltf
     from clients.web.eye_form import read_profile_file
-    from clients.web.page_state import PageState, fragment_of, restore
+    from clients.web.page_link import fragment_of, restore
+    from clients.web.page_state import PageState
     from clients.web.picture import photo_picture
     from estimator.periphery.population import load_measured_eyes
     from estimator.profiles.files import load_profile

@@ -22,7 +22,8 @@ from clients.web.comparison import (
 )
 from clients.web.eye_form import SIDES, EyeSide
 from clients.web.figure_worker import Ask, FigureFailed
-from clients.web.page_state import PageState, fragment_of
+from clients.web.page_link import fragment_of
+from clients.web.page_state import PageState
 from clients.web.picture_panel import PictureSender
 from clients.web.widgets import Delayed, title, warn
 

@@ -36,7 +36,8 @@ from clients.web.figure_worker import FigureWorker
 from clients.web.filter_thread import FilterThread, SentPicture
 from clients.web.guard import FULL, MAX_PAGES, page_of
 from clients.web.header import Header
-from clients.web.page_state import SCENES, PageState, restore
+from clients.web.page_link import restore
+from clients.web.page_state import SCENES, PageState
 from clients.web.page_texts import (
     CONDITIONS_HELP,
     HAZE_OFFER,

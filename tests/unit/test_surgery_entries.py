@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from clients.web.eye_form import EyeForm
-from clients.web.page_state import PageState, fragment_of, restore
+from clients.web.page_link import fragment_of, restore
+from clients.web.page_state import PageState
 from estimator import parse_profile
 from estimator.estimate.model import eye_model
 

@@ -24,7 +24,8 @@ from clients.web.controls import (
     distance_text,
     pupil_by_light_mm,
 )
-from clients.web.page_state import PageState, fragment_of, restore
+from clients.web.page_link import fragment_of, restore
+from clients.web.page_state import PageState
 from clients.web.picture import chart_picture, coarser, png_of, shown_srgb8
 from filter_service import RgbdView
 from tests.unit.web_parts import a_picture

@@ -29,7 +29,8 @@ from clients.web.eye_form import (
     EyeForm,
     preset_titles,
 )
-from clients.web.page_state import PageState, fragment_of, restore
+from clients.web.page_link import fragment_of, restore
+from clients.web.page_state import PageState
 from clients.web.picture import chart_picture
 from estimator import parse_profile, preset_names
 from tests.unit.web_parts import a_picture
