@@ -52,6 +52,10 @@ _LABELS = {
     "correction": "Correction",
     "correction.kind": "Correction",
     "correction.design": "Design",
+    "correction.adds_dpt": "Additions of the implant",
+    "correction.zone_adds_dpt": "Additions of the zones",
+    "correction.zone_diameters_mm": "Diameters of the zones",
+    "correction.rigid": "Rigid lens",
     "straylight": "Straylight",
     "yellowing": "Yellowing of the lens",
 }

@@ -170,7 +170,8 @@ GAZE_H = NumberField("gaze_h_deg", "Gaze, right", "°", -20.0, 20.0, 1.0, digits
 GAZE_V = NumberField("gaze_v_deg", "Gaze, up", "°", -45.0, 30.0, 1.0, digits=0)
 AGE = NumberField("age_years", "Age", "years", 5.0, 90.0, 1.0, 30.0, digits=0)
 AGE_B = replace(AGE, name="age_b_years", label="Age of B")
-CONDITIONS = (PUPIL, FOCUS, DISTANCE, GAZE_H, GAZE_V, AGE, AGE_B)
+AGES = (AGE, AGE_B)
+CONDITIONS = (PUPIL, FOCUS, DISTANCE, GAZE_H, GAZE_V, *AGES)
 """Viewing conditions, in the order of the page."""
 
 DISTANCES_M = {"6 m": 6.0, "4 m": 4.0, "1 m": 1.0, "66 cm": 0.66, "40 cm": 0.4}

@@ -16,6 +16,7 @@ from typing import Any, Literal
 
 from clients.web.controls import (
     ABERRATION,
+    AGE,
     BIFOCAL_ADD,
     CORRECTION,
     CORRIDOR,
@@ -103,8 +104,19 @@ YOUNG_YEARS = 25.0
 
 GONE = "The cataract is gone with the natural lens; this is usual at this age. "
 
+MILD = (
+    " Published nuclear and cortical cataracts scatter, on average, no more than a "
+    "healthy eye of about 70; enter a measured log s of 1.5 or more for a dense one."
+)
+MILD_RATIO = 1.2
+"""Haze of a cataract, relative to its age, below which `MILD` explains it."""
+
 CATARACT = "cataract"
 """Preset that has the haze of a cataract when it is selected."""
+
+PRESET_AGES_YEARS = {CATARACT: 72.0}
+"""Ages that presets set when they are selected: people at cataract surgery."""
+
 DESIGNS = {
     "monofocal": "Monofocal",
     "bifocal": "Bifocal",
@@ -370,6 +382,11 @@ class EyeForm:
         worn = self.worn.file_body if self.worn.kind == "file" else None
         return not (self.wears_correction and _is_after_surgery(worn or {}))
 
+    @property
+    def is_before_surgery(self) -> bool:
+        """Return whether the entries describe the eye before surgery."""
+        return self.wears_correction and self.worn.kind in SURGERIES
+
     def body(self, *, age_years: float) -> dict[str, Any]:
         """Return the profile.
 
@@ -427,15 +444,23 @@ class EyeForm:
             f"{10.0 ** (log_s - young):.1f} times as much as in a young eye, and "
             f"{by_age:.1f} times as much as is usual at this age (log s {log_s:.2f} "
             "at 7°)."
+            + MILD
+            * (is_cataract and haze.log_s is not None and by_age < MILD_RATIO)
         )
 
-    def choose_preset(self, name: str) -> None:
-        """Select a preset; a cataract comes with haze and a yellow lens."""
+    def choose_preset(self, name: str, *, age_years: float) -> float:
+        """Select a preset; a cataract comes with haze, a yellow lens and an age.
+
+        Return the age of the person with the preset.
+        """
         if name == CATARACT and self.preset != CATARACT:
             self.haze, self.yellowing = "posterior_subcapsular", "seen"
         elif self.preset == CATARACT and name != CATARACT:
             self.haze, self.yellowing = "none", "none"
+            if age_years == PRESET_AGES_YEARS[CATARACT]:
+                age_years = AGE.initial
         self.preset = name
+        return PRESET_AGES_YEARS.get(name, age_years)
 
     def _source_body(self) -> dict[str, Any]:
         if self.source == "preset":

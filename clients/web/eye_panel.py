@@ -60,6 +60,10 @@ NO_HIGHER_ORDER = (
 RESIDUAL_PREFIX = "Residual "
 """Start of labels that the heading of their group says."""
 
+MAX_HALF_CHARACTERS = 12
+"""Length of the longest choice that half of the panel's width shows whole."""
+
+BEFORE_SURGERY = "Before surgery:"
 REMAINS = "Remains after surgery, through a 4 mm pupil:"
 
 CATARACT_AGE_YEARS = 50.0
@@ -92,6 +96,7 @@ class EyePanel:
     name : of the eye or state
     on_change : called when the entries have changed and are valid
     age_years : returns the age of the person
+    set_age : called with the age that a preset comes with
     on_file : called with the eye, and the name and content of an uploaded profile file
     """
 
@@ -101,11 +106,12 @@ class EyePanel:
         form: EyeForm,
         on_change: Callable[[], None],
         age_years: Callable[[], float],
+        set_age: Callable[[float], None],
         on_file: Callable[[EyeName, str, bytes], Awaitable[None]],
     ) -> None:
         self.name, self.form = name, form
         self._on_change, self._on_file = on_change, on_file
-        self._age_years = age_years
+        self._age_years, self._set_age = age_years, set_age
         self._entries: dict[tuple[str, bool], ui.input] = {}
         self._choices: dict[str, ui.element] = {}  # by profile field
         self._marked: Collection[str] = ()
@@ -135,7 +141,7 @@ class EyePanel:
             preset = select(
                 preset_titles(),
                 form.preset,
-                self._takes(form.choose_preset),
+                self._takes(self._choose_preset),
                 label="Preset",
             )
             self._choices["name"] = preset.classes("oc-wide").mark("preset")
@@ -164,6 +170,8 @@ class EyePanel:
 
     def _prescription(self) -> None:
         form = self.form
+        if form.is_before_surgery:
+            ui.label(BEFORE_SURGERY).classes("oc-hint oc-before-surgery")
         with ui.element("div").classes("oc-fields"):
             sphere = self._entry(SPHERE, form.texts)
             # linked with the entry in both directions
@@ -275,8 +283,7 @@ class EyePanel:
                     self._takes(partial(setattr, form, name)),
                     label=label,
                 )
-                # the longest name would be cut
-                is_long = getattr(form, name) == "posterior_subcapsular"
+                is_long = len(options[getattr(form, name)]) > MAX_HALF_CHARACTERS
                 width = "oc-whole" if is_long else "oc-half"
                 self._choices[field] = entry.classes(width).mark(name)
             if form.haze == "measured":
@@ -302,9 +309,10 @@ class EyePanel:
             )
             can_correct = not form.wears_correction or worn.kind in DISTANCE_KINDS
             if form.source == "prescription" and can_correct:
-                small_button("Correct fully", self._correct_fully).tooltip(
-                    "Wear the prescription above; keep kind of lens and addition"
-                )
+                with small_button("Correct fully", self._correct_fully):
+                    ui.tooltip(
+                        "Wear the prescription above; keep kind of lens and addition"
+                    ).props('anchor="top middle" self="bottom middle"')
         if not form.wears_correction:
             return
         with ui.element("div").classes("oc-line"):
@@ -369,6 +377,11 @@ class EyePanel:
                 self.box.client.run_javascript(FOCUS % (self.name, name))
 
         return handle
+
+    def _choose_preset(self, name: str) -> None:
+        age_years = self.form.choose_preset(name, age_years=self._age_years())
+        if age_years != self._age_years():
+            self._set_age(age_years)
 
     def _correct_fully(self) -> None:
         self.form.correct_fully()

@@ -27,8 +27,8 @@ SHOWN = {"OD": "Right eye", "OS": "Left eye", "both": "Both"}
 EDITED = {"A": "A", "B": "B"}
 
 COMPARED = (
-    "B started as a copy of A: change what differs, which is marked in orange. “B = A” "
-    "copies A again."
+    "A and B are two states of this eye. What differs is marked in orange; “B = A” "
+    "copies all entries of A."
 )
 EYE_HELP = (
     "Describe the eye by its prescription, a preset or a file. A normal eye of 30 "
@@ -121,6 +121,7 @@ class EyesCard:
                 self._panels[name] = EyePanel(
                     *(name, form, self._on_change),
                     age_years=lambda: self._state.values[number.name],
+                    set_age=self._ages[number].move,
                     on_file=self._on_file,
                 )
 

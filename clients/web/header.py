@@ -132,7 +132,7 @@ class Header:
         with self._nav:
             for label, icon, tip, act in buttons:
                 ui.button(label, icon=icon, on_click=_reported(act)).props(
-                    "outline dense no-caps size=sm"
+                    f'outline dense no-caps size=sm aria-label="{label}"'
                 ).classes("oc-download").tooltip(tip)
         ui.on("oc-fragment", self._change_fragment)
 

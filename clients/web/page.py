@@ -307,6 +307,7 @@ class Page:
         request = self.state.request()
         self._report_problems()
         self.eyes.show_differences()
+        self.scenarios.show_changes(self.scene.kind)
         self._show_haze_offer()
         if request is None:
             return
@@ -481,7 +482,6 @@ class Page:
     def _set_picture(self, picture: Picture) -> None:
         self.state.adapt_to(self.scene.kind)
         self.state.set_picture(picture)
-        self.scenarios.leave_unless(self.scene.kind)
         self._show_values()
         self.rows[DISTANCE.name].enable(
             picture.distance_dpt is not None, "as in the picture"

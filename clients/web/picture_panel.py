@@ -434,7 +434,7 @@ class PictureView(Element, component="picture_view.js"):  # type: ignore[call-ar
         smallest_rows: Mapping[EyeName, int | None],
         notation: Notation,
     ) -> None:
-        """Label the rows of a chart, and describe the smallest row that each eye reads.
+        """Label the rows of a chart, and describe the row that each eye just reads.
 
         Parameters
         ----------
@@ -460,11 +460,11 @@ class PictureView(Element, component="picture_view.js"):  # type: ignore[call-ar
                 for k, row in enumerate(picture.chart_rows)
             ],
             captions={
-                eye: "smallest line read: "
-                + (
-                    "none of these rows"
+                eye: (
+                    "reads none of these lines"
                     if read is None
-                    else ", ".join(
+                    else "reads about the line "
+                    + ", ".join(
                         f"{CAPTION_NAMES[each]}{text}"
                         for each, text in zip(shown, texts[read], strict=True)
                     )

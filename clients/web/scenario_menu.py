@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from typing import Any
 
 from nicegui import events, ui
 
-from clients.scenarios import scenarios
+from clients.scenarios import Scenario, scenarios
+from clients.web.controls import AGES, CONDITIONS
 from clients.web.page_state import PageState
 from clients.web.widgets import select
 
 CHOOSE = "choose"
+CONDITION_TEXTS = [number for number in CONDITIONS if number not in AGES]
 
 
 class ScenarioMenu:
@@ -38,19 +41,47 @@ class ScenarioMenu:
         self._text.set_visibility(scenario is not None)
         if scenario is None:
             return
-        self._text.text = (
-            f"A: {scenario.a.title}. B: {scenario.b.title}. "
-            f"{scenario.sees} {scenario.leaves_out}"
-        )
         self._state.start_scenario(scenario)
+        self._initial = self._entries(scenario.scene)
+        self.show_changes(scenario.scene)
         self._on_start(scenario.scene)
 
-    def leave_unless(self, scene: str) -> None:
-        """Forget the scenario if another scene was selected."""
+    def show_changes(self, scene: str) -> None:
+        """Say what of the scenario has changed; forget it when its eyes are left."""
         scenario = scenarios().get(self._list.value)
-        if scenario is not None and scenario.scene != scene:
+        if scenario is None:
+            return
+        if set(self._state.names) != set(self._initial["names"]):
             self.clear()
+            return
+        entries = self._entries(scene)
+        changed = [part for part, one in self._initial.items() if one != entries[part]]
+        self._text.text = scenario_text(scenario, changed)
+
+    def _entries(self, scene: str) -> dict[str, Any]:
+        """Return the parts of a scenario that a person can change."""
+        state = self._state
+        state.read_profiles()
+        shown = {one.name: one.show(state.values[one.name]) for one in CONDITION_TEXTS}
+        profiles = {
+            f"entries of {state.title(name)}": state.valid_profiles.get(name)
+            for name in state.names
+        }
+        return {
+            "names": state.names,
+            "scene": scene,
+            "viewing conditions": shown,
+            **profiles,
+        }
 
     def clear(self) -> None:
         """Forget the scenario, for example when a link was followed."""
         self._list.value = CHOOSE
+
+
+def scenario_text(scenario: Scenario, changed: Sequence[str] = ()) -> str:
+    """Return what a scenario shows, what it leaves out, and what was changed in it."""
+    told = f"{scenario.sees} {scenario.leaves_out}"
+    if changed:
+        told = f"Changed since: {', '.join(changed)}. As the scenario started: {told}"
+    return f"A: {scenario.a.title}. B: {scenario.b.title}. {told}"

@@ -17,13 +17,24 @@ from numpy.typing import NDArray
 from clients.acuity_text import Notation, acuity_text
 from clients.figures import EyeStudy, acuity_log_mar
 
-SHARP_LOG_MAR = 0.2
-"""Acuity 0.63 (20/32), up to which letters look sharp enough for any daily task."""
+SHARP_LOG_MAR = 0.1
+"""Acuity 0.8 (20/25), where the range of normal vision ends (International Council of
+Ophthalmology, Visual Standards, 2002)."""
+
+ALMOST_SHARP_LOG_MAR = 0.2
+"""Acuity 0.63 (20/32), which is enough for almost any task."""
 
 READABLE_LOG_MAR = 0.3
 """Acuity 0.5 (20/40): smaller than newsprint at 40 cm."""
 
 BLURRED_LOG_MAR = 0.4
+WORDS = (
+    (SHARP_LOG_MAR, "Sharp"),
+    (ALMOST_SHARP_LOG_MAR, "Almost sharp"),
+    (BLURRED_LOG_MAR, "Slightly blurred"),
+)
+"""Words for acuities up to a limit."""
+
 LEAST_DPT = 0.01
 FAR = "far away"
 FOCUS_CODES = (
@@ -143,9 +154,7 @@ def _sight_sentence(
     predicted = "predicted acuity worse than 0.05"
     if math.isfinite(log_mar):
         predicted = f"predicted acuity {_acuity(log_mar, notation)}"
-    word = "Blurred"
-    if log_mar <= BLURRED_LOG_MAR:
-        word = "Sharp" if log_mar <= SHARP_LOG_MAR else "Slightly blurred"
+    word = next((each for limit, each in WORDS if log_mar <= limit), "Blurred")
     haze = f" ({WITHOUT_HAZE})" if has_haze else ""
     where = _distance(object_dpt)
     where = where if where == FAR else f"at {where}"

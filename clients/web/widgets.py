@@ -178,6 +178,10 @@ class SliderRow(Element, component="range_slider.js"):  # type: ignore[call-arg]
         except ValueError as error:
             warn(f"{self.number.label}: {error}")
             return
+        self.move(value)
+
+    def move(self, value: float) -> None:
+        """Show a value and report it, as if the slider was moved."""
         self.show(value)
         self._on_move(self.number.name, value)
 

@@ -103,7 +103,7 @@ def test_a_link_keeps_residual_haze_and_yellowing():
 def test_the_cataract_has_haze_and_says_how_much():
     form = EyeForm("OD", source="preset")
     assert form.haze_text(age_years=AGE) == ""
-    form.choose_preset("cataract")
+    assert form.choose_preset("cataract", age_years=30.0) == 72.0
     haze = parse_profile(form.body(age_years=AGE)).straylight
     assert haze.log_s == 1.48  # J. Ophthalmol. 2017, 5649532
     assert form.yellowing == "seen"
@@ -115,12 +115,17 @@ def test_the_cataract_has_haze_and_says_how_much():
         f"times as much as in a young eye, and {times[1]:.1f} times as much as is "
         "usual at this age (log s 1.48 at 7°)."
     )
+    form.haze = "nuclear"  # a published mean of mild cataracts
+    assert "healthy eye of about 70" in form.haze_text(age_years=72.0)
+    assert "healthy eye of about 70" not in form.haze_text(age_years=40.0)
+    assert not form.is_before_surgery
     form.wears_correction = True
     form.choose_worn("iol")
+    assert form.is_before_surgery
     text = form.haze_text(age_years=AGE)
     assert text.startswith("The cataract is gone with the natural lens; ")
     assert "1.0 times as much as is usual" in text
-    form.choose_preset("myopia")
+    assert form.choose_preset("myopia", age_years=72.0) == 30.0
     assert (form.haze, form.yellowing) == ("none", "none")
 
 

@@ -27,6 +27,7 @@ from clients.web.controls import (
 from clients.web.page_link import fragment_of, restore
 from clients.web.page_state import PageState
 from clients.web.picture import chart_picture, coarser, png_of, shown_srgb8
+from clients.web.scenario_menu import scenario_text
 from filter_service import RgbdView
 from tests.unit.web_parts import a_picture
 
@@ -140,6 +141,22 @@ def test_a_scenario_sets_both_states_as_they_are_described(name):
     assert request.pupil_diameter_mm == scenario.pupil_diameter_mm
     assert request.focus_dpt == pytest.approx(scenario.focus_dpt, abs=1e-4)
     assert state.problems() == []
+
+
+def test_a_scenario_says_what_was_changed_in_it():
+    scenario = scenarios()["cataract_trifocal"]
+    text = scenario_text(scenario)
+    assert text.startswith("A: Cataract, old spectacles. B: Trifocal implant. Before,")
+    assert scenario.leaves_out in text
+    text = scenario_text(scenario, ["scene", "entries of B"])
+    assert "Changed since: scene, entries of B. As the scenario started: " in text
+    assert scenario.sees in text
+
+
+def test_additions_of_zones_are_named():
+    soft = scenarios()["myopia_soft_lens"]
+    labels = [one.label for one in differences(soft.a.profile, soft.b.profile)]
+    assert labels == ["Additions of the zones", "Diameters of the zones"]
 
 
 def test_the_focus_on_a_chart_ends_with_the_chart():

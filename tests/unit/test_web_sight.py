@@ -34,11 +34,11 @@ def sentences(correction, focus_dpt, *, age_years=60):
 
 @pytest.mark.long("an eye with three foci, estimated")
 def test_a_trifocal_eye_that_reads_is_not_called_blurred():
-    for focus_dpt, where in ((0.25, "4.0 m"), (2.5, "40 cm")):
+    for focus_dpt, where in ((0.25, "Sharp at 4.0 m"), (2.5, "Almost sharp at 40 cm")):
         sight, notes, text = sentences(TRIFOCAL, focus_dpt)
         assert notes  # by its distance focus alone, it would be blurred
         assert sight["log_mar"] < 0.2
-        assert text.startswith(f"Sharp at {where}: predicted acuity 0.")
+        assert text.startswith(f"{where}: predicted acuity 0.")
         assert "lurred" not in text
         assert "accommodation" not in text
         assert "reads 0.50 or better from far away to 3" in text
@@ -84,6 +84,11 @@ def test_nothing_is_said_of_the_focus_until_the_acuity_is_known():
         "Blurred at 40 cm: predicted acuity worse than 0.05 (straylight is not "
         "included)."
     )
+    for log_mar, word in ((0.1, "Sharp"), (0.14, "Almost sharp"), (0.21, "Slightly")):
+        shown = eye_sentences(
+            {"log_mar": log_mar, "readable_dpt": None}, [], {}, **state
+        )
+        assert shown.startswith(word)
     several = {"log_mar": 0.3, "readable_dpt": [(0.0, 0.5), (2.0, 3.0)]}
     assert eye_sentences(several, [note], {}, **state) == (
         "Slightly blurred at 40 cm: predicted acuity 20/40. Several foci: reads 20/40 "

@@ -131,6 +131,9 @@ def test_a_scenario_sets_scene_conditions_and_states(page):
       .filter(text => text.scrollWidth > text.clientWidth + 1)
       .map(text => text.innerText)"""
     assert page.page.evaluate(cut_off) == []
+    page.choose("Courtyard")
+    page.page.get_by_text("Changed since: scene, viewing").wait_for()
+    assert page.page.get_by_text(scenario.leaves_out).is_visible()
 
 
 def test_nothing_is_said_of_the_eye_before(page):

@@ -80,7 +80,7 @@ def test_every_row_has_its_whole_label_and_nothing_covers_it(page, size):
         size == "desk"
     )
     for caption in page.page.locator(".oc-caption").all():
-        assert "smallest line read: logMAR" in caption.inner_text()
+        assert "reads about the line logMAR" in caption.inner_text()
 
 
 _ONE = """element => {

@@ -71,7 +71,7 @@ def test_the_focus_follows_the_distance(page):
 def test_an_eye_that_reads_no_row_is_told(page):
     _chart(page)
     page.entry("sphere_dpt").fill("-8")
-    _caption(page, "Right eye: smallest line read: none of these rows")
+    _caption(page, "Right eye: reads none of these lines")
 
 
 def test_the_focus_of_a_click_has_two_decimals(page):
