@@ -213,8 +213,8 @@ def legend(study: EyeStudy, notation: Notation = "decimal") -> str:
         + ". “Best corrected”: with the sphere and cylinder of the highest visual "
         "Strehl ratio through that pupil, and an acuity not below “as it is”. Charts: "
         "the eye tries to focus on each; rows in "
-        f"{NOTATION_WORDS[notation]}, ◂ the smallest read; the rows below it are shown "
-        "but not read."
+        f"{NOTATION_WORDS[notation]}, ◂ the row nearest to the predicted acuity; the "
+        "rows below it are shown but not read."
     )
 
 
@@ -258,7 +258,7 @@ def chart_row(facts: EyeFacts, pupil_mm: float, *, name: str = "") -> Row:
 
 
 def _row_marks(found: dict[str, Any], notation: Notation) -> tuple[Mark, ...]:
-    """Return the size of each row, and which one is the smallest line read."""
+    """Return the size of each row, and which one the acuity is nearest to."""
     rows = chart_rows()
     sizes = [log_mar for log_mar, _ in rows]
     acuity = found["log_mar"]

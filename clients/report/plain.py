@@ -63,8 +63,11 @@ def _difference_text(before: EyeFacts, after: EyeFacts) -> str:
     if not more and not less:
         return "They differ by less than one row of a chart."
     parts = [
-        f"{word} rows at {' and '.join(at)}"
-        for word, at in (("smaller", more), ("only larger", less))
+        f"{word} {' and '.join(at)}"
+        for word, at in (
+            (f"reads smaller letters than {before.label} at", more),
+            ("needs larger ones at" if more else "needs larger letters at", less),
+        )
         if at
     ]
-    return f"{after.label} reads {', and '.join(parts)}."
+    return f"{after.label} {', and '.join(parts)}."

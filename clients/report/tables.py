@@ -16,8 +16,8 @@ from clients.report.facts import (
     spectacles_for,
 )
 from clients.report.html_page import Table
-from clients.report.text import entered_text, um_text
-from estimator import EyeWithImplant
+from clients.report.text import entered_text, short_text, um_text
+from estimator import EyeProfile, EyeWithImplant, WornLens
 
 N_COLUMNS, N_JOINT_COLUMNS = 4, 3
 """Columns of the coefficients of one eye, and of two."""
@@ -247,6 +247,18 @@ def _circle_text(measured: dict[str, Any]) -> str:
     )
 
 
+def through_text(profile: EyeProfile) -> str:
+    """Return whether a refraction is that of the eye or through what it wears."""
+    lens = profile.correction
+    if isinstance(lens, WornLens) and lens.kind == "iol":
+        return "with the implant"
+    if profile.surgery is not None:
+        return "after surgery"
+    if isinstance(lens, WornLens) and lens.kind == "lenslets":
+        return "through the spectacles without their lenslets"
+    return "without a correction" if lens is None else f"through the {short_text(lens)}"
+
+
 def field_table_block(facts: EyeFacts, *, name: str = "") -> Table:
     """Return the refraction along the horizontal meridian."""
     rows = tuple(
@@ -258,7 +270,8 @@ def field_table_block(facts: EyeFacts, *, name: str = "") -> Table:
         for entry in facts.numbers["field"]
     )
     return Table(
-        f"Along the horizontal{f' ({name})' if name else ''}",
+        f"Along the horizontal{f' ({name})' if name else ''}, "
+        f"{through_text(facts.study.profile)}",
         rows,
         head=("h, deg", "M, dpt", "J0, dpt"),
         note="Relaxed, 4 mm pupil, at the cornea; h to the person's right.",

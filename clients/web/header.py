@@ -117,9 +117,9 @@ class Header:
             self._nav = ui.element("nav").classes("oc-downloads")
             self._nav.props("aria-label=Downloads")
         buttons: list[tuple[str, str, str, Action]] = [
-            ("Picture", "download", "The image that the eye sees, PNG", self._picture),
-            ("Profile", "download", "The eye's profile, JSON", self._profile),
-            ("Report", "download", REPORT_TIP, self._report),
+            ("Picture", "image", "The image that the eye sees, PNG", self._picture),
+            ("Profile", "badge", "The eye's profile, JSON", self._profile),
+            ("Report", "article", REPORT_TIP, self._report),
             (
                 *("Copy link", "link"),
                 "Link to these entries, including the access token",

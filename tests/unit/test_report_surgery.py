@@ -22,7 +22,8 @@ from clients.report.content import (
     subtitle,
 )
 from clients.report.facts import facts_of, refraction_of
-from estimator import eye_biometry
+from clients.report.tables import through_text
+from estimator import eye_biometry, parse_profile
 
 MYOPE = {
     "kind": "prescription",
@@ -190,7 +191,7 @@ def test_a_comparison_starts_with_plain_words(before, with_implant):
         if facts.notation == "feet":
             acuity = f"20/{20 * 10**log_mar:.0f}"
         assert re.search(rf"{facts.label[0]}[^.]*: .*{acuity} at 40 cm", text)
-    assert "smaller rows at 6 m" in text  # by 0.5 instead of 2.5 dpt of myopia
+    assert "smaller letters than" in text  # by 0.5 instead of 2.5 dpt of myopia
     assert "labeled one, which refers to an aqueous" in repr(document)
 
 
@@ -204,3 +205,24 @@ def test_maps_of_two_eyes_have_the_same_colors(before, with_implant):
         limits.append([axes.collections[0].get_clim() for axes in maps])
     assert len(limits[0]) == 4
     assert limits[0] == limits[1]
+
+
+@pytest.mark.parametrize(
+    ("correction", "text"),
+    [
+        (None, "without a correction"),
+        ({"sphere_dpt": -2.0}, "through the spectacles"),
+        ({"kind": "contact_lens", "sphere_dpt": -2.0}, "through the contact lens"),
+        (
+            {"kind": "lenslets", "sphere_dpt": -2.0},
+            "through the spectacles without their lenslets",
+        ),
+        ({"kind": "iol", "residual_sphere_dpt": 0.0}, "with the implant"),
+        ({"kind": "laser", "residual_sphere_dpt": 0.0}, "after surgery"),
+    ],
+)
+def test_a_table_of_the_field_says_through_what(correction, text):
+    body = {"kind": "prescription", "sphere_dpt": -2.5, "age_years": 60}
+    if correction is not None:
+        body["correction"] = correction
+    assert through_text(parse_profile(body)) == text
