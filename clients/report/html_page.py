@@ -60,8 +60,8 @@ ul { margin: 0; padding-left: 4mm; font-size: 9pt; }
 figure { margin: 0; }
 figure img { display: block; width: 100%; height: auto; }
 figure.picture img { border: .6pt solid #d9dee4; }
-.marked { position: relative; padding-right: 16.5mm; }
-.marks { position: absolute; top: 0; right: 0; bottom: 0; width: 24mm; margin: 0;
+.marked { position: relative; }
+.marks { position: absolute; top: 0; right: 0; bottom: 0; width: 28mm; margin: 0;
   padding: 0; list-style: none; }
 .marks li { position: absolute; right: 0; margin-top: -1.6mm; text-align: right;
   white-space: nowrap; font-size: 9pt; line-height: 3.2mm; color: #4c5866; }
@@ -78,8 +78,8 @@ footer { border-top: .4pt solid #4c5866; margin-top: 4mm; padding-top: 1.5mm;
 """
 """Style for screen and paper.  On paper, the footer is in the page margins."""
 
-MARK_MM = 16.5
-"""Width of the marks beside an image."""
+MARK_MM_PER_CHARACTER = 1.65
+"""Width beside an image for its marks, such as ``0.3 · 20/40``."""
 
 MARK_LINE_MM = 3.2
 """Height of a mark's line."""
@@ -279,9 +279,13 @@ def _picture(picture: Picture, width_mm: float) -> str:
     image = f'<img alt="{caption}" src="{_jpeg(picture.image)}">'
     if picture.marks:
         height, width = picture.image.shape[:2]
-        marks = _without_overlap(picture.marks, (width_mm - MARK_MM) * height / width)
+        beside_mm = MARK_MM_PER_CHARACTER * max(len(m.text) for m in picture.marks)
+        marks = _without_overlap(picture.marks, (width_mm - beside_mm) * height / width)
         items = "".join(map(_mark, marks))
-        image = f'<div class="marked">{image}<ul class="marks">{items}</ul></div>'
+        style = f' style="padding-right:{beside_mm:.1f}mm"'
+        image = (
+            f'<div class="marked"{style}>{image}<ul class="marks">{items}</ul></div>'
+        )
     return f'<figure class="picture">{image}<figcaption>{caption}</figcaption></figure>'
 
 

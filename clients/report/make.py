@@ -10,7 +10,8 @@ from typing import Any
 
 from clients.acuity_text import Notation
 from clients.figures.study import PUPILS_MM, Profile, ProgressCallback, profile_of
-from clients.report.content import comparison_document, eye_document
+from clients.report.comparison import comparison_document
+from clients.report.content import eye_document
 from clients.report.facts import EyeFacts, check_text, distinct_labels, facts_of
 from clients.report.html_page import Document, html_of
 from estimator import drawn_profiles, thread_count

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from clients.acuity_text import acuity_text
 from clients.figures.study import PUPILS_MM
 from clients.report.facts import DISTANCES_M, SIDE_NAMES, EyeFacts
@@ -46,6 +48,11 @@ def _read_text(facts: EyeFacts, distance_m: float) -> str:
     return f"{acuity_text(found['log_mar'], facts.notation)} {where}"
 
 
+def listed(texts: Sequence[str]) -> str:
+    """Return texts as a list in a sentence."""
+    return " and ".join(filter(None, [", ".join(texts[:-1]), texts[-1]]))
+
+
 def _difference_text(before: EyeFacts, after: EyeFacts) -> str:
     """Return at which distances the second eye reads more or less."""
     more, less = [], []
@@ -63,7 +70,7 @@ def _difference_text(before: EyeFacts, after: EyeFacts) -> str:
     if not more and not less:
         return "They differ by less than one row of a chart."
     parts = [
-        f"{word} {' and '.join(at)}"
+        f"{word} {listed(at)}"
         for word, at in (
             (f"reads smaller letters than {before.label} at", more),
             ("needs larger ones at" if more else "needs larger letters at", less),

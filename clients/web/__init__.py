@@ -6,7 +6,8 @@ guard          access control by token, limits on requests
 page           the page: layout and event handlers
 header         downloads, and the link in the browser's address
 page_texts     explanations on the page
-page_state     state of a page, independent of the layout, and as text for links
+page_state     state of a page, independent of the layout
+page_link      the entries of a page as text, for links
 controls       the numbers that can be entered, with limits, steps, initial values
 written        those numbers as people write them
 comparison     states A and B of one person: names, differences, a joined picture

@@ -15,12 +15,8 @@ from clients.figures import (
     wavefront_range_um,
 )
 from clients.figures.style import new_figure
-from clients.report.content import (
-    PAIR_MAP_MM,
-    comparison_document,
-    eye_document,
-    subtitle,
-)
+from clients.report.comparison import PAIR_MAP_MM, comparison_document
+from clients.report.content import eye_document, subtitle
 from clients.report.facts import facts_of, refraction_of
 from clients.report.tables import through_text
 from estimator import eye_biometry, parse_profile
