@@ -146,9 +146,10 @@ def wide_view():
 def test_two_sides_agree_about_a_flat_scene(wide_view, monkeypatch):
     monkeypatch.setattr(peer_optiland, "PEERS", peer_optiland.PEERS[:3])
     rows = list(flat_rows(wide_view, 1))
+    missing = [row.missing for row in rows if row.missing is not None]
+    if missing:
+        pytest.skip(f"not installed: {missing[0]}")
     for row in rows:
-        if row.missing is not None:
-            pytest.skip(f"not installed: {row.missing}")
         assert row.error > 40.0
         assert row.other_error > 38.0
     # more field points and components are nearer to the same PSFs at all points
