@@ -38,7 +38,7 @@ from tests.benchmarks.harness import Row, Run
 from tests.benchmarks.rows import row_of
 from tests.benchmarks.service_stream import PROFILE, Stream, view_of
 
-MINUTES = 10
+MINUTES = 8
 CASES = ("overload", "sharing", "killed", "restart", "upgrade", "soak")
 RATE_HZ = 30.0
 TOO_FAST = 3.0

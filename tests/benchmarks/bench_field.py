@@ -14,19 +14,24 @@ have counted PSF samples and no time: they are scatters without tiles or merging
 would be another method's time.  ``error`` is the PSNR of linear light; that of 8-bit
 images stands beside it, as in the paper.
 
-References are kept under out/dense_references.  A whole run also plots field.png:
+References are kept under out/dense_references; they and methods without a time are
+computed on all cores, before anything is timed.  A whole run also plots field.png:
 error against time and memory, medians over eyes, scenes and states.
 """
 
+import os
 import sys
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
 import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
 
 from filter_service.rendering.native import NativeRenderer
+from filter_service.rgbd_view import RgbdView
 from tests.benchmarks.dense_reference import dense_reference
 from tests.benchmarks.field_methods import (
     FOCUS_RANGE_DPT,
@@ -42,7 +47,7 @@ from tests.benchmarks.published_figures import CONDITIONS
 from tests.benchmarks.rows import row_of
 from tests.numerical.scene_frames import SCENES, scene_view
 
-MINUTES = 22
+MINUTES = 18
 FIXED = State(5.0, 0.5)
 SEED = 5
 REPEATS = 3
@@ -136,36 +141,84 @@ def random_states(eye: str, scene: str, size: str, count: int) -> list[State]:
     ]
 
 
-def eye_rows(renderer, eye: str, part: Part) -> list[Row]:
-    """Return the rows of one eye and image size."""
+@dataclass(frozen=True)
+class Case:
+    """A method, a scene and a state of one eye and image size."""
+
+    eye: str
+    size: str
+    scene: str
+    view: RgbdView
+    method: Method
+    state: State
+
+
+def cases(eye: str, part: Part) -> list[Case]:
+    """Return the cases of one eye and image size."""
     size = dict(zip(("width_px", "height_px"), part.size, strict=True))
     views = {scene: scene_view(scene, **size) for scene in part.scenes}
-    bench = EyeBench(renderer, eye, list(views.values()))
-    rows = [
-        method_row(bench, eye, scene, view, part.name, method, state)
+    return [
+        Case(eye, part.name, scene, view, method, state)
         for method in part.methods
         for scene, view in views.items()
         for state in method.states(
             FIXED, random_states(eye, scene, part.name, part.random_count)
         )
     ]
+
+
+def untimed_rows(eye: str, part: Part) -> dict[int, Row]:
+    """Compute all references, and return the rows that have no time, by case.
+
+    This runs on all cores at once, before anything is timed.
+    """
+    found = {}
+    own = cases(eye, part)
+    bench = EyeBench(None, eye, [case.view for case in own])
+    for number, case in enumerate(own):
+        if case.method.timed:
+            reference(bench, case)
+        else:
+            found[number] = method_row(bench, case)
+    return found
+
+
+def timed_rows(renderer, eye: str, part: Part, untimed: dict[int, Row]) -> list[Row]:
+    """Return the rows of one eye and image size, with those that have no time."""
+    own = cases(eye, part)
+    bench = EyeBench(renderer, eye, [case.view for case in own])
+    rows = [
+        untimed[number] if number in untimed else method_row(bench, case)
+        for number, case in enumerate(own)
+    ]
     bench.release()
     return rows
 
 
-def method_row(bench, eye: str, scene: str, view, size: str, method, state) -> Row:
-    """Return the row of one method, scene and state."""
-    bins = method.on_axis or view.width_px * view.height_px > UNBINNED_PIXEL_COUNT
-    exact = bench.exact_state(state, on_axis=method.on_axis)
-    results = method.run(bench, view, state, REPEATS)
-    last = results[-1]
-    error = measures(last.color, dense_reference(view, exact, bins=bins))
+def is_binned(case: Case) -> bool:
+    """Return whether PSFs of the reference are those of bins."""
+    view = case.view
+    return case.method.on_axis or view.width_px * view.height_px > UNBINNED_PIXEL_COUNT
+
+
+def reference(bench: EyeBench, case: Case) -> NDArray[np.float64]:
+    """Return the reference (height, width, 3) of a case."""
+    exact = bench.exact_state(case.state, on_axis=case.method.on_axis)
+    return dense_reference(case.view, exact, bins=is_binned(case))
+
+
+def method_row(bench: EyeBench, case: Case) -> Row:
+    """Return the row of a case."""
+    method, scene, size = case.method, case.scene, case.size
+    results = method.run(bench, case.view, case.state, REPEATS)
+    last, bins = results[-1], is_binned(case)
+    error = measures(last.color, reference(bench, case))
     place = "on the axis" if method.on_axis else "over the field"
     psfs = "PSF of every pixel"
     if bins:
         psfs = "bins of " + "0.2 deg and " * (not method.on_axis) + "0.005 dpt"
     return row_of(
-        *("field", method.name, eye, f"{scene} {size} {state}"),
+        *("field", method.name, case.eye, f"{scene} {size} {case.state}"),
         [result.render_ms for result in results if method.timed],
         *("psnr_db", error.psnr_db, f"dense, {place}, {psfs}"),
         used_mb=last.memory_mb,
@@ -246,12 +299,20 @@ def median_points(rows: list[FieldRow], column: str) -> list[tuple[float, float]
 
 def measure(run: Run) -> tuple[list[Row], dict[str, list[dict]]]:
     """Return the rows of all parts; a row that two of them have counts once."""
+    parts = QUICK_PARTS if run.is_quick else PARTS
+    jobs = [(eye, part) for part in parts for eye in part.eyes]
+    with ProcessPoolExecutor(min(4, os.cpu_count() or 1)) as pool:
+        untimed = []
+        for (eye, part), found in zip(
+            jobs, pool.map(untimed_rows, *zip(*jobs, strict=True)), strict=True
+        ):
+            print(f"{part.name} {eye}: references", file=sys.stderr, flush=True)
+            untimed.append(found)
     rows, renderer = {}, NativeRenderer()
-    for part in QUICK_PARTS if run.is_quick else PARTS:
-        for eye in part.eyes:
-            print(f"{part.name} {eye}", file=sys.stderr, flush=True)
-            for row in eye_rows(renderer, eye, part):
-                rows[row.case, row.setting, row.method] = row
+    for (eye, part), own in zip(jobs, untimed, strict=True):
+        print(f"{part.name} {eye}", file=sys.stderr, flush=True)
+        for row in timed_rows(renderer, eye, part, own):
+            rows[row.case, row.setting, row.method] = row
     found = list(rows.values())
     if not run.is_quick:
         plot_errors(found, written_path("field.png"))

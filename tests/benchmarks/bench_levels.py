@@ -32,7 +32,7 @@ from tests.benchmarks.view_sources import EyeState
 from tests.numerical.plan_cases import traced_eye
 from tests.numerical.scene_frames import SCENES, scene_view
 
-MINUTES = 6
+MINUTES = 5.5
 ONE_STATE = "one state"
 SIZE_PX, BLOCK_PX = (320, 180), 32
 STATES = ((3.0, 0.3), (5.0, 1.2), (3.0, 0.3))

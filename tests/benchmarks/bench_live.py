@@ -36,7 +36,7 @@ from tests.grid_specs import grid_spec
 from tests.numerical.plan_cases import traced_eye
 from tests.numerical.synthetic import psnr_db
 
-MINUTES = 9
+MINUTES = 6
 SIZES = ((480, 270), (1280, 720))
 PATH = path_settings("courtyard")
 WARM_UPS = 2

@@ -50,7 +50,7 @@ from tests.grid_specs import grid_spec
 from tests.numerical.scene_frames import scene_view
 from tests.numerical.synthetic import psnr_db, tangents
 
-MINUTES = 8
+MINUTES = 3
 SCENES = ("courtyard", "primitives", "photograph")
 SIZES = {"1832x1920": ((1832, 1920), 96.0), "1280x720": ((1280, 720), 50.0)}
 HEADSET = "1832x1920"
