@@ -21,7 +21,7 @@ from tests.benchmarks.rows import row_of
 from tests.benchmarks.view_sources import Window
 from tests.numerical.scene_frames import scene_view
 
-MINUTES = 7
+MINUTES = 2
 STATES = (State(5.0, 0.5), State(4.55, 0.8))
 """The first has the pupil of a published node."""
 
