@@ -14,8 +14,8 @@ HINTS: dict[WornKind, str] = {
     "gaze sliders to look through other parts of the lens.",
     "lenslets": "396 lenslets around a clear center; use the gaze sliders to look "
     "through other parts.",
-    "iol": "The natural lens of the eye above is gone, with its aberrations, "
-    "accommodation, haze and yellowing; length and cornea stay.",
+    "iol": "The natural lens is gone, with its aberrations, accommodation, haze and "
+    "yellowing. Length and cornea stay.",
     "laser": "Everything but the cornea of the eye above stays.",
 }
 """Visible sentences."""

@@ -328,6 +328,7 @@ class EyePanel:
                 self._takes(partial(setattr, worn, "design")),
                 label="Design",
             ).classes("oc-wide oc-worn-design")
+        ui.label(correction_hint(form)).classes("oc-note oc-hint")
         residual = [number for number in worn.entries if number in RESIDUAL]
         self._worn_entries([n for n in worn.entries if n not in RESIDUAL])
         self._additions = ui.label("").classes("oc-hint oc-additions")
@@ -335,7 +336,6 @@ class EyePanel:
             with ui.element("div").props('role=group aria-label="Residual refraction"'):
                 ui.label(REMAINS).classes("oc-hint")
                 self._worn_entries(residual, kind="oc-three")
-        ui.label(correction_hint(form)).classes("oc-note oc-hint")
         self.show_additions()
 
     def _worn_entries(self, numbers: Iterable[NumberField], kind: str = "") -> None:

@@ -1,5 +1,11 @@
 """Explanations on the page."""
 
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from clients.scenarios import Scenario
+
 PICTURE_HELP = (
     "Left of the divider is the scene, right of it what the eye sees; in a comparison, "
     "A and B, which “Side by side” shows whole. Drag the divider, or hold a button to "
@@ -28,3 +34,11 @@ NOT_MEDICAL = (
     "Not a medical device: for demonstration and research. It models the optics of an "
     "eye, not its health, and does not replace an examination."
 )
+
+
+def scenario_text(scenario: Scenario, changed: Sequence[str] = ()) -> str:
+    """Return what a scenario shows, what it leaves out, and what was changed in it."""
+    told = f"{scenario.sees} {scenario.leaves_out}"
+    if changed:
+        told = f"Changed since: {', '.join(changed)}. As the scenario started: {told}"
+    return f"A: {scenario.a.title}. B: {scenario.b.title}. {told}"

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 from nicegui import events, ui
 
-from clients.scenarios import Scenario, scenarios
+from clients.scenarios import scenarios
 from clients.web.controls import AGES, CONDITIONS
 from clients.web.page_state import PageState
+from clients.web.page_texts import scenario_text
 from clients.web.widgets import select
 
 CHOOSE = "choose"
@@ -77,11 +78,3 @@ class ScenarioMenu:
     def clear(self) -> None:
         """Forget the scenario, for example when a link was followed."""
         self._list.value = CHOOSE
-
-
-def scenario_text(scenario: Scenario, changed: Sequence[str] = ()) -> str:
-    """Return what a scenario shows, what it leaves out, and what was changed in it."""
-    told = f"{scenario.sees} {scenario.leaves_out}"
-    if changed:
-        told = f"Changed since: {', '.join(changed)}. As the scenario started: {told}"
-    return f"A: {scenario.a.title}. B: {scenario.b.title}. {told}"

@@ -26,8 +26,8 @@ from clients.web.controls import (
 )
 from clients.web.page_link import fragment_of, restore
 from clients.web.page_state import PageState
+from clients.web.page_texts import scenario_text
 from clients.web.picture import chart_picture, coarser, png_of, shown_srgb8
-from clients.web.scenario_menu import scenario_text
 from filter_service import RgbdView
 from tests.unit.web_parts import a_picture
 
