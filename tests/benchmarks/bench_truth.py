@@ -37,7 +37,7 @@ from tests.benchmarks.truth_points import (
     point_frame,
 )
 
-MINUTES = 12
+MINUTES = 8
 METHODS = {
     # method: settings, goal of the image of a point
     "on-axis": ({"mode": "on-axis"}, 0.01),

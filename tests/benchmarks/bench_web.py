@@ -35,7 +35,7 @@ from tests.benchmarks.harness import ROOT, Row, Run
 from tests.benchmarks.rows import row_of
 from tests.web.browser import PageUnderTest, open_browser
 
-MINUTES = 6
+MINUTES = 5
 SLIDERS = {
     "pupil": ("OD", ".oc-slider input[data-name=pupil_diameter_mm]"),
     "focus": ("OD", ".oc-slider input[data-name=focus_dpt]"),

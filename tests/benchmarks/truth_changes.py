@@ -11,7 +11,7 @@ from tests.benchmarks.truth_points import eye_of, opened
 from tests.benchmarks.view_sources import linear_color
 from tests.numerical.scene_frames import scene_view
 
-SIZE_PX = 240, 135
+SIZE_PX = 160, 90
 HALVINGS = 9
 LEAST_CHANGE = 1e-4
 """Changes of light below which ratios do not count."""
