@@ -12,7 +12,7 @@ from tests.benchmarks.view_sources import linear_color
 from tests.numerical.scene_frames import scene_view
 
 SIZE_PX = 160, 90
-HALVINGS = 9
+STEP_COUNT = 6
 LEAST_CHANGE = 1e-4
 """Changes of light below which ratios do not count."""
 
@@ -62,12 +62,13 @@ def _with_noise(view: RgbdView, ratio: float) -> RgbdView:
 
 
 STEPS: dict[str, tuple[float, Callable]] = {
-    "depth noise": (0.02, lambda step: (step, {})),
-    "pupil": (0.2, lambda step: (0.0, {"pupil_diameter_mm": step})),
-    "focus": (0.2, lambda step: (0.0, {"focus_dpt": step})),
-    "gaze": (2.0, lambda step: (0.0, {"gaze_deg": (step, 0.6 * step)})),
+    "depth noise": (0.005, lambda step: (step, {})),
+    "pupil": (0.05, lambda step: (0.0, {"pupil_diameter_mm": step})),
+    "focus": (0.05, lambda step: (0.0, {"focus_dpt": step})),
+    "gaze": (0.5, lambda step: (0.0, {"gaze_deg": (step, 0.6 * step)})),
 }
-"""First step of each input, in its unit, and what it adds: noise, arguments."""
+"""First step of each input, in its unit, and what it adds: noise, arguments.  After a
+larger step, the largest change is not in proportion: an edge has passed a pixel."""
 
 
 def halvings(
@@ -115,7 +116,7 @@ def halvings(
                     still = frame(name, 0.0, tolerance)
                     changes = [
                         frame(name, first / 2.0**k, tolerance) - still
-                        for k in range(HALVINGS)
+                        for k in range(STEP_COUNT)
                     ]
                     found[name, tolerance] = {
                         "largest": np.array([np.abs(c).max() for c in changes]),
