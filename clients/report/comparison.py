@@ -158,7 +158,13 @@ def _field(before: EyeFacts, after: EyeFacts) -> Section:
 
 
 def _moments(before: EyeFacts, after: EyeFacts) -> tuple[str, str]:
-    """Return the names of the eyes in tables: before and after, or their sides."""
+    """Return the names of the eyes in tables.
+
+    They are labels of one letter, such as A and B, before and after, or their sides.
+    """
+    first, second = _short_labels(before, after)
+    if len(first) == len(second) == 1:
+        return first, second
     sides = [facts.study.profile.eye_side for facts in (before, after)]
     if sides[0] == sides[1]:
         return "before", "after"
@@ -248,8 +254,10 @@ def _eye_note(moment: str, facts: EyeFacts) -> str:
     """Return the name of an eye, its powers as entered, and spectacles for it."""
     entered = entered_text(facts.study.profile)
     spectacles = f"{spectacles_text(facts)}."
-    name = moment.capitalize()
-    if facts.label != moment:
+    name = moment[:1].upper() + moment[1:]
+    if facts.label.startswith(moment):
+        name = facts.label
+    else:
         name += f", {facts.label}"
     return " ".join(text for text in (f"{name}:", entered, spectacles) if text)
 

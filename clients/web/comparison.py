@@ -59,6 +59,7 @@ _LABELS = {
     "straylight": "Straylight",
     "yellowing": "Yellowing of the lens",
 }
+GONE_CATARACT = "gone with the natural lens"
 _LABEL_HEIGHT_PX, _GAP_PX = 32, 8
 
 
@@ -120,9 +121,13 @@ def _flat(body: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
         found[f"{prefix}kind"] = "spectacles"  # without a kind
     if "sphere_dpt" in body:
         found |= {f"{prefix}cylinder_dpt": 0.0, f"{prefix}axis_deg": 0.0}
+    if body.get("kind") in ("contact_lens", "iol", "laser"):
+        found[f"{prefix}spherical_aberration_um"] = 0.0
+    has_implant = (body.get("correction") or {}).get("kind") == "iol"
     for name, value in body.items():
         if name == "straylight":
-            found[name] = _haze_text(value)
+            is_gone = has_implant and "cataract" in value
+            found[name] = GONE_CATARACT if is_gone else _haze_text(value)
         elif isinstance(value, Mapping):
             found |= _flat(value, f"{prefix}{name}.")
         else:
@@ -221,7 +226,9 @@ def label_of(name: EyeName, body: Mapping[str, Any]) -> str:
     parts = [f"{title_of(name, is_comparing=True)}: {SIDES[side_of(name)].lower()}"]
     if "name" in flat and flat.get("kind") == "preset":
         parts.append(_text("name", flat))
-    parts.append(_powers_text(flat, ""))
+    powers = _powers_text(flat, "")
+    is_surgery = flat.get("correction.kind") in ("iol", "laser")
+    parts.append(f"{powers} before surgery" if powers and is_surgery else powers)
     parts.append(f"correction: {_correction_text(flat)}")
     if AGE.name in flat:
         parts.append(_text(AGE.name, flat))

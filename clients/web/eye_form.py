@@ -75,7 +75,7 @@ NO_SURGERY = (
     "surfaces. Choose spectacles or a contact lens, or describe the eye before surgery "
     "by its prescription, a preset or a measured wavefront."
 )
-AS_IN_FILE = "As in the file"
+AS_LOADED = "Other, as loaded"
 SURGERIES: tuple[WornKind, ...] = ("iol", "laser")
 """Kinds that change the eye of the entries above them."""
 
@@ -205,7 +205,7 @@ class CorrectionForm:
     @property
     def kinds(self) -> dict[WornKind, str]:
         """Return the kinds that can be selected."""
-        return KINDS if self.file_body is None else {**KINDS, "file": AS_IN_FILE}
+        return KINDS if self.file_body is None else {**KINDS, "file": AS_LOADED}
 
     @property
     def entries(self) -> tuple[NumberField, ...]:

@@ -39,7 +39,8 @@ FIGURES_HELP = (
 FIGURE_TEXTS = {
     "wavefront": "Deviation of the light from a perfect focus over the pupil: the more "
     "even the color, the sharper the image. RMS is its mean size; below 0.07 µm the "
-    "image of a point hardly differs from a perfect one.",
+    "image of a point hardly differs from a perfect one. Rings of a multifocal lens "
+    "are not included.",
     "field": "Refraction and blur by direction, as the person sees the surroundings. "
     "The center is where the person looks. Blur toward the side is normal.",
     "section": "The eye from the side, with the lens and the rays of a far point.",

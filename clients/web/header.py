@@ -44,7 +44,8 @@ return location.hash.slice(1);
 SKIP = """() => {
   const part = document.querySelector("%s");
   part.scrollIntoView();
-  part.querySelector("button, input, [tabindex='0']").focus();
+  part.tabIndex = -1;  // not a button in it, which would take the same Enter
+  part.focus();
 }"""
 COPY = """
 const link = location.origin + "/?token=" + TOKEN + location.hash;
@@ -60,7 +61,8 @@ else {  // no clipboard API over HTTP from another machine
 
 
 REPORT_TIP = (
-    "Report on this eye, HTML: open it in a browser and print it, or save it as PDF"
+    "Report through pupils of 3 and 5 mm, HTML: open it in a browser and print it, or "
+    "save it as PDF"
 )
 
 Action = Callable[[], Awaitable[None]]

@@ -68,7 +68,7 @@ export default {
                 @keyup.space="hold('')" @keydown.enter.prevent="hold(name)"
                 @keyup.enter="hold('')" @blur="hold('')" :aria-pressed="held === name"
                 >Hold to see {{ name === "scene" ? "the scene" : label(name) }}</button>
-        <button type="button" class="oc-tool" @click="fill">Full screen</button>
+        <button type="button" class="oc-tool" title="Esc leaves it" @click="fill">Full screen</button>
         <slot></slot>
       </div>
     </div>`,

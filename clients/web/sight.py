@@ -138,6 +138,7 @@ def eye_sentences(
 def _sentence(note: str) -> str:
     text = note.removeprefix("blurred: ").rstrip(".")
     text = text.replace(", as is every distance", "")  # it may still read there
+    text = text.replace(" is sharp", " is exactly in focus")
     return f"{text[:1].upper()}{text[1:]}."
 
 

@@ -12,7 +12,7 @@ from PIL import Image
 from clients.acuity_text import acuity_text
 from clients.scenarios import scenarios
 from clients.web.blur_widths import WIDTHS_ARCMIN, nearest_familiar_object
-from clients.web.comparison import differences, joined_png, short_label_of
+from clients.web.comparison import differences, joined_png, label_of, short_label_of
 from clients.web.controls import (
     AGE,
     AGE_B,
@@ -151,6 +151,16 @@ def test_a_scenario_says_what_was_changed_in_it():
     text = scenario_text(scenario, ["scene", "entries of B"])
     assert "Changed since: scene, entries of B. As the scenario started: " in text
     assert scenario.sees in text
+
+
+def test_a_cataract_is_gone_with_the_natural_lens():
+    a = {"kind": "prescription", "sphere_dpt": -2.5, "straylight": {}}
+    a["straylight"] = {"cataract": "nuclear"}
+    b = a | {"correction": {"kind": "iol", "residual_sphere_dpt": 0.0}}
+    found = {one.label: (one.a, one.b) for one in differences(a, b)}
+    assert found["Straylight"] == ("Nuclear cataract", "gone with the natural lens")
+    assert "-2.50 dpt before surgery, correction: Intraocular" in label_of("OD_B", b)
+    assert "surgery" not in label_of("OD", a)
 
 
 def test_additions_of_zones_are_named():

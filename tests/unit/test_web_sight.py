@@ -49,7 +49,7 @@ def test_readers_are_sharp_at_the_page_and_blurred_far_away():
     assert sentences(READERS, 2.5)[2].startswith("Sharp at 40 cm: predicted acuity 1.")
     text = sentences(READERS, 0.25)[2]
     assert text.startswith("Blurred at 4.0 m: predicted acuity 0.2")
-    assert "Nothing beyond 43 cm is sharp" in text
+    assert "Nothing beyond 43 cm is exactly in focus" in text
     text = sentences(None, 2.5)[2]
     assert text.startswith("Blurred at 40 cm: predicted acuity 0.2")
     assert "every distance" not in text  # far away it reads
