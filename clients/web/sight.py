@@ -122,7 +122,7 @@ def eye_sentences(
         sentence, others = LENSLETS, [*notes]
     elif sight is not None:
         worn = profile.get("correction") or {}
-        reasons = [*map(_sentence, of_focus)]
+        reasons = [*map(_reason, of_focus)]
         if reasons and worn.get("kind") == "iol":
             reasons = [IMPLANT_FOCUS]
         sentence = _sight_sentence(
@@ -137,9 +137,14 @@ def eye_sentences(
 
 def _sentence(note: str) -> str:
     text = note.removeprefix("blurred: ").rstrip(".")
-    text = text.replace(", as is every distance", "")  # it may still read there
-    text = text.replace(" is sharp", " is exactly in focus")
     return f"{text[:1].upper()}{text[1:]}."
+
+
+def _reason(note: str) -> str:
+    """Return the part of a note on the focus that is for the patient."""
+    text = _sentence(note).partition(";")[0].rstrip(".")
+    text = text.replace(", as is every distance", "")  # it may still read there
+    return text.replace(" is sharp", " is exactly in focus") + "."
 
 
 def _sight_sentence(

@@ -81,10 +81,11 @@ def test_the_focus_of_a_click_has_two_decimals(page):
         box["x"] + 0.35 * box["width"], box["y"] + 0.84 * box["height"]
     )
     page.settle(after=number)
-    note = page.page.locator(".oc-note").filter(has_text="accommodation stops")
+    note = page.page.locator(".oc-note").filter(has_text="The eye lacks")
     note.first.wait_for()
     text = note.first.inner_text()
-    assert re.search(r"[Ff]ocus \d\.\d{1,2} dpt is", text)
+    focus = page.slider("focus_dpt")
+    assert re.fullmatch(r"\d\.\d{1,2}", focus.input_value())
     assert re.match(r"(Slightly b|B)lurred at .*: predicted acuity 0\.\d\d\.", text)
 
 
