@@ -116,6 +116,23 @@ def test_two_eyes_share_a_context(scene):
         assert counted_objects() == before
 
 
+def test_lists_may_grow_between_a_frame_and_the_reading_of_its_counters(scene):
+    with callers_context():
+        textures = Textures()
+        view, target = texture_view(textures, scene), textures.new("rgba8", SIZE_PX)
+        with EyeFilter("myopia", scene.camera, SETTINGS, gl_context="current") as eye:
+            frame_of(eye, view, target)  # waits for its counters
+            eye.filter_textures(view, target, **STATE)
+            gpu = eye.builder.engine._gpu
+            for name in ("ENTRIES", "ENTRIES_SPARE"):  # as another eye's frame does
+                gpu.storage(name, 2 * gpu.buffers[name].size)
+            gpu.wait()
+            first = frame_of(eye, view, target)
+            later = frame_of(eye, view, target)
+            assert later.earlier.number > first.earlier.number
+            assert later.earlier.is_filtered
+
+
 def test_what_textures_cannot_have_is_refused(scene):
     with callers_context():
         textures = Textures()

@@ -148,6 +148,7 @@ class ListPasses:
         self.atlas = atlas
         self._is_late = is_late
         self.lists = ListTotals()
+        self._capacities = (0, 0)
         self.bands: list[tuple[int, int, int]] = []
         self._tile_sums = np.zeros((0, TILE_KINDS), np.int64)
 
@@ -173,7 +174,7 @@ class ListPasses:
         Otherwise `splat_bands` must run.
         """
         self.lists = read_totals(words)
-        entries, spare = self.capacities
+        entries, spare = self._capacities
         needs_spare = self.lists.longest > SORT_CAPACITIES[-1]
         return (
             self.strip.bin_count <= MAX_BAND_BINS
@@ -181,9 +182,11 @@ class ListPasses:
             and (not needs_spare or self.lists.entry_count <= spare)
         )
 
-    @property
-    def capacities(self) -> tuple[int, int]:
-        """Capacities of the two list buffers, in entries, for a single band."""
+    def _capacities_now(self) -> tuple[int, int]:
+        """Return the capacities of the two list buffers, in entries, for a single band.
+
+        Another frame may release these buffers before the totals of this one are read.
+        """
         entries, spare = (
             min(
                 self.strip.buffers[name].size // ENTRY_BYTES - SPARE_ENTRIES,
@@ -204,7 +207,7 @@ class ListPasses:
             ENTRIES=_list_bytes(0),
             ENTRIES_SPARE=_list_bytes(0),
         )
-        entry_capacity, spare_capacity = self.capacities
+        self._capacities = entry_capacity, spare_capacity = self._capacities_now()
         with self.strip.timer.stage("bin_ms"):
             self.strip.run(
                 "count_bins",
