@@ -46,6 +46,10 @@ CATARACTS = {"nuclear": 1.22, "cortical": 1.26, "posterior_subcapsular": 1.48}
 """Mean log s of 592, 776 and 75 eyes before surgery (standard deviations 0.20, 0.23 and
 0.34), from five studies: J. Ophthalmol. 2017, 5649532."""
 
+LOG_S_RANGE = (0.5, 1.9)
+"""Range of log s.  By the inverse square law, 1.9 scatters 86 to 95 % of the light, and
+from 1.97 on, more than there is."""
+
 N_ANGLES = 4000
 
 

@@ -22,6 +22,7 @@ from clients.web.written import (
 from clients.web.written import begins_prescription as begins_prescription
 from clients.web.written import prescription_texts as prescription_texts
 from estimator.dynamics import steady_pupil_mm
+from estimator.media import LOG_S_RANGE
 
 HIDDEN = 0.05
 """Fraction of a number without decimals that is not shown."""
@@ -224,7 +225,7 @@ RESIDUAL_AXIS = replace(AXIS, name="residual_axis_deg", label="Residual axis")
 RESIDUAL = (RESIDUAL_SPHERE, RESIDUAL_CYLINDER, RESIDUAL_AXIS)
 """Refraction that remains after surgery, at the cornea."""
 
-STRAYLIGHT = NumberField("log_s", "log s at 7°", "", 0.5, 2.5, 0.05, 1.2)
+STRAYLIGHT = NumberField("log_s", "log s at 7°", "", *LOG_S_RANGE, 0.05, 1.2)
 ABERRATION = NumberField(
     *("spherical_aberration_um", "Spherical aberration", "µm", -2.0, 2.0, 0.01),
     is_signed=True,

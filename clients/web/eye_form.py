@@ -44,6 +44,7 @@ from estimator import (
     preset_names,
     profile_body,
 )
+from estimator.media import Straylight
 
 EyeSide = Literal["OD", "OS"]
 Source = Literal["prescription", "preset", "file"]
@@ -424,15 +425,28 @@ class EyeForm:
             found["yellowing"] = self.yellowing
         return found
 
+    def choose_haze(self, haze: Haze, *, age_years: float) -> None:
+        """Select the straylight; a measured one starts as that of the choice before."""
+        light = self._straylight(age_years=age_years)
+        if haze == "measured" and light is not None:
+            log_s = light.age_log_s if light.log_s is None else light.log_s
+            shown = STRAYLIGHT.show(STRAYLIGHT.clamped(log_s))
+            self.media_texts[STRAYLIGHT.name] = shown
+        self.haze = haze
+
+    def _straylight(self, *, age_years: float) -> Straylight | None:
+        """Return the straylight of valid entries."""
+        try:
+            return parse_profile(self.body(age_years=age_years)).straylight
+        except ValueError:  # reported at its entry
+            return None
+
     def haze_text(self, *, age_years: float) -> str:
         """Return how much light the eye scatters, in a sentence; empty without.
 
         A cataract's straylight goes with the natural lens.
         """
-        try:
-            haze = parse_profile(self.body(age_years=age_years)).straylight
-        except ValueError:  # reported at its entry
-            return ""
+        haze = self._straylight(age_years=age_years)
         if haze is None:
             return ""
         log_s = haze.age_log_s if haze.log_s is None else haze.log_s

@@ -36,6 +36,7 @@ from clients.web.eye_form import (
     SIDES,
     YELLOWINGS,
     EyeForm,
+    Haze,
     preset_titles,
 )
 from clients.web.widgets import (
@@ -273,14 +274,17 @@ class EyePanel:
         """Show the entries of straylight and yellowing."""
         form = self.form
         with ui.element("div").classes("oc-fields"):
-            for options, name, label, field in (
-                (HAZES, "haze", "Straylight", "straylight"),
-                (YELLOWINGS, "yellowing", "Yellowing", "yellowing"),
+            for options, name, label, field, take in (
+                (HAZES, "haze", "Straylight", "straylight", self._choose_haze),
+                (
+                    *(YELLOWINGS, "yellowing", "Yellowing", "yellowing"),
+                    partial(setattr, form, "yellowing"),
+                ),
             ):
                 entry = select(
                     options,
                     getattr(form, name),
-                    self._takes(partial(setattr, form, name)),
+                    self._takes(take),
                     label=label,
                 )
                 is_long = len(options[getattr(form, name)]) > MAX_HALF_CHARACTERS
@@ -382,6 +386,9 @@ class EyePanel:
         age_years = self.form.choose_preset(name, age_years=self._age_years())
         if age_years != self._age_years():
             self._set_age(age_years)
+
+    def _choose_haze(self, haze: Haze) -> None:
+        self.form.choose_haze(haze, age_years=self._age_years())
 
     def _correct_fully(self) -> None:
         self.form.correct_fully()

@@ -16,7 +16,7 @@ import msgspec
 from msgspec import UNSET, Meta, UnsetType
 
 from estimator.eye.parameters import PARAMETERS, Parameter
-from estimator.media import BROWN
+from estimator.media import BROWN, LOG_S_RANGE
 from estimator.profiles.coefficients import CoefficientsUm, OrderedZernikeBody
 from estimator.profiles.correction_bodies import (
     AxisDeg,
@@ -83,7 +83,11 @@ class StraylightBody(Body, kw_only=True):
     log_s: (
         Annotated[
             float,
-            Meta(ge=0.5, le=2.5, description="measured at 7 deg; not with `cataract`"),
+            Meta(
+                ge=LOG_S_RANGE[0],
+                le=LOG_S_RANGE[1],
+                description="measured at 7 deg; not with `cataract`",
+            ),
         ]
         | UnsetType
     ) = UNSET

@@ -7,6 +7,7 @@ import pytest
 
 from estimator.media import (
     CATARACTS,
+    LOG_S_RANGE,
     Straylight,
     channel_gains,
     cie_glare_per_sr,
@@ -265,6 +266,17 @@ def test_the_filter_adds_what_the_profile_asks_for_and_tells_its_time():
     red, _, blue = found.color[100, 110]
     assert red > 1.5 * blue > 0.0
     assert found.stage_times_ms["media_ms"] > 0.0
+
+
+@pytest.mark.parametrize("age_years", [0.0, 90.0])
+@pytest.mark.parametrize("pigmentation", [0.0, 1.2])
+def test_no_eye_scatters_more_light_than_there_is(age_years, pigmentation):
+    for log_s in LOG_S_RANGE:
+        eye = Straylight(age_years, pigmentation, log_s)
+        assert 0.0 < eye.fraction < 0.96
+    body = {"kind": "preset", "name": "cataract", "straylight": {"log_s": 2.2}}
+    with pytest.raises(ProfileError, match=r"1\.9"):
+        parse_profile(body)
 
 
 def test_most_profiles_ask_for_nothing():

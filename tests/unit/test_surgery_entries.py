@@ -148,6 +148,18 @@ def test_haze_of_a_profile_fills_the_entries(straylight, haze):
     assert len(digests) == 1
 
 
+def test_measured_haze_starts_as_that_of_the_choice_before():
+    form = EyeForm("OD", source="preset", haze="posterior_subcapsular")
+    form.choose_haze("measured", age_years=AGE)
+    assert form.body(age_years=AGE)["straylight"] == {"log_s": 1.48}
+    form.choose_haze("age", age_years=80.0)
+    form.choose_haze("measured", age_years=80.0)
+    assert form.media_texts["log_s"] == "1.39"
+    form.choose_haze("none", age_years=80.0)
+    form.choose_haze("measured", age_years=30.0)
+    assert form.media_texts["log_s"] == "1.39"  # as it was typed last
+
+
 def test_haze_that_the_entries_cannot_show_stays_in_the_profile():
     body = {"kind": "prescription", "sphere_dpt": -1, "straylight": {"pigmentation": 1}}
     form = EyeForm("OD")
@@ -158,7 +170,7 @@ def test_haze_that_the_entries_cannot_show_stays_in_the_profile():
 
 def test_a_wrong_straylight_is_said():
     form = EyeForm("OD", haze="measured", media_texts={"log_s": "9"})
-    with pytest.raises(ValueError, match=r"9 is out of range; allowed: 0\.5 to 2\.5"):
+    with pytest.raises(ValueError, match=r"9 is out of range; allowed: 0\.5 to 1\.9"):
         form.body(age_years=AGE)
     assert form.haze_text(age_years=AGE) == ""
 
