@@ -9,12 +9,11 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import j0, ndtr
+from scipy.special import ndtr
 
 from clients.figures.defocus import added_power_dpt
 from clients.scenarios import Scenario, scenario_view, scenarios
@@ -111,14 +110,9 @@ def figures() -> list[Figure]:
             "sum over the picture, CIE 135/1-1999",
         ),
         Figure(
-            *("night_trifocal", "radius of the halo", "arcmin"),
-            *(halo_radius_arcmin, halo_sum_arcmin, 0.5),
+            *("night_trifocal", "light over 12 arcmin from a lamp", "ratio"),
+            *(halo_ratio, halo_sum_ratio, 0.005),
             "sum over the steps",
-        ),
-        Figure(
-            *("night_trifocal", "radius of the halo", "arcmin"),
-            *(halo_radius_arcmin, halo_ray_arcmin, 1.5),
-            "slope of the outermost ray; fringes are 2 arcmin apart",
         ),
         Figure(
             *("progressive_stairs", "refraction in the line of sight", "dpt"),
@@ -143,15 +137,6 @@ def modulation_sum(
     step_um = wave_um(ends[1], y) - wave_um(ends[0], y)
     total = np.exp(2e3j * np.pi / NM * step_um)[inside].sum()
     return abs(total) / np.count_nonzero(x**2 + y**2 <= pupil_mm**2 / 4.0)
-
-
-def spherical_um(square_mm2: NDArray, c40_um: float) -> NDArray:
-    """C(4,0) on 6 mm whose power over 4 mm is zero."""
-    rho = square_mm2 / 9.0
-    own_um = c40_um * np.sqrt(5.0) * (6.0 * rho**2 - 6.0 * rho + 1.0)
-    ratio = (4.0 / 6.0) ** 2
-    c20_um = np.sqrt(15.0) * ratio * (ratio - 1.0) * c40_um
-    return own_um - c20_um * np.sqrt(3.0) * (2.0 * square_mm2 / 4.0 - 1.0)
 
 
 def at_pupil_dpt(power_dpt: float, distance_m: float) -> float:
@@ -264,10 +249,10 @@ def implant_modulation(name: str, object_dpt: float) -> float:
     )
 
 
-def implant_sum(
-    name: str, object_dpt: float, steps_um: Callable[[NDArray, Mapping], NDArray]
-) -> float:
-    """Sum over the pupil, with the coefficients of the eye and the steps of its lens.
+def implant_wave(
+    name: str, steps_um: Callable[[NDArray, Mapping], NDArray]
+) -> Callable[[NDArray, NDArray], NDArray]:
+    """Path through the eye of state B, whose lens has steps, by position in the pupil.
 
     Coefficients of an eye with rings are those of its distance focus.
     """
@@ -278,7 +263,7 @@ def implant_sum(
     )
     terms = [
         (n, m, float(seen.values[(n * (n + 2) + m) // 2]))
-        for n in range(2, 7)
+        for n in range(1, 7)
         for m in range(-n, n + 1, 2)
     ]
     lens = one.b.profile["correction"]
@@ -287,10 +272,21 @@ def implant_sum(
         square = x**2 + y**2
         rho, phi = 2.0 * np.sqrt(square) / pupil_mm, np.arctan2(y, x)
         eye_um = sum(c * zernike(n, m, rho, phi) for n, m, c in terms)
-        # Tilt moves the grating and keeps its contrast.
-        return eye_um + steps_um(square, lens) - object_dpt * square / 2.0
+        return eye_um + steps_um(square, lens)
 
-    return modulation_sum(wave_um, pupil_mm, CPD)
+    return wave_um
+
+
+def implant_sum(
+    name: str, object_dpt: float, steps_um: Callable[[NDArray, Mapping], NDArray]
+) -> float:
+    """Sum over the pupil, with coefficients of the eye and the steps of its lens."""
+    of_far_um = implant_wave(name, steps_um)
+
+    def wave_um(x, y):
+        return of_far_um(x, y) - object_dpt * (x**2 + y**2) / 2.0
+
+    return modulation_sum(wave_um, scenarios()[name].pupil_diameter_mm, CPD)
 
 
 def edof_modulation() -> float:
@@ -325,54 +321,37 @@ def trifocal_sum() -> float:
     return implant_sum("cataract_trifocal", 2.5, trifocal_um)
 
 
-HALO_ARCMIN = np.arange(12.0, 25.0, 0.2)
+CORE_ARCMIN = 12.0
+"""Radius about a lamp that contains the light of the far and the intermediate focus."""
+
+IMAGE_DEG = 8.0
+"""Width of the image of a Fourier sum, for which the steps of the lens are sampled."""
 
 
-def edge_arcmin(density: NDArray, radius_arcmin: NDArray) -> float:
-    """Outermost radius at which light is half as dense as it is within the halo."""
-    inside = density[(radius_arcmin > 13.0) & (radius_arcmin < 18.0)].mean()
-    return float(radius_arcmin[density > inside / 2.0].max())
-
-
-@cache
-def halo_radius_arcmin() -> float:
+def halo_ratio() -> float:
     one = scenarios()["night_trifocal"]
     found = Eye(dict(one.b.profile)).encircled_energy(
-        radius_arcmin=HALO_ARCMIN,
+        radius_arcmin=[CORE_ARCMIN],
         pupil_diameter_mm=one.pupil_diameter_mm,
         focus_dpt=0.0,
         wavelength_nm=NM,
     )
-    density = np.diff(found.values) / np.diff(HALO_ARCMIN**2)
-    return edge_arcmin(density, (HALO_ARCMIN[1:] + HALO_ARCMIN[:-1]) / 2.0)
+    return 1.0 - float(found.values[0])
 
 
-def halo_sum_arcmin() -> float:
-    """The same of the light of each ring of the pupil, with its Bessel function."""
-    one = scenarios()["night_trifocal"]
-    count = 8000
-    radius_mm = (np.arange(count) + 0.5) / count * one.pupil_diameter_mm / 2.0
-    lens = one.b.profile["correction"]
-    wave_um = trifocal_um(radius_mm**2, lens) + spherical_um(
-        radius_mm**2, 0.27 + lens["spherical_aberration_um"]
-    )
-    field = radius_mm * np.exp(2e3j * np.pi / NM * wave_um)
-    angle_mrad = np.radians(HALO_ARCMIN / 60.0) * 1e3
-    waves = 2e3 * np.pi / NM * np.outer(angle_mrad, radius_mm)
-    return edge_arcmin(np.abs(j0(waves) @ field) ** 2, HALO_ARCMIN)
-
-
-def halo_ray_arcmin() -> float:
-    """The near focus times the radius of the pupil, and spherical aberration."""
-    one = scenarios()["night_trifocal"]
-    lens = one.b.profile["correction"]
-    edge_mm = one.pupil_diameter_mm / 2.0
-    # the power of a diffractive order is proportional to the wavelength
-    near_dpt = lens["adds_dpt"][1] * IMPLANT_POWER_RATIO * NM / 550.0
-    c40_um = 0.27 + lens["spherical_aberration_um"]
-    ends = spherical_um(np.square([edge_mm - 1e-3, edge_mm + 1e-3]), c40_um)
-    slope_mrad = near_dpt * edge_mm + float(np.diff(ends)[0]) / 2e-3
-    return math.degrees(slope_mrad / 1e3) * 60.0
+def halo_sum_ratio() -> float:
+    """The same of a Fourier sum over the pupil, with the coefficients of the eye."""
+    pupil_mm = scenarios()["night_trifocal"].pupil_diameter_mm
+    step_mm, count = NM * 1e-6 / math.radians(IMAGE_DEG), 4096
+    x = (np.arange(count) - count // 2) * step_mm
+    x = x[np.abs(x) < pupil_mm / 2.0]
+    x, y = np.meshgrid(x, x)
+    wave_um = implant_wave("night_trifocal", trifocal_um)(x, y)
+    field = np.exp(2e3j * np.pi / NM * wave_um) * (x**2 + y**2 < pupil_mm**2 / 4.0)
+    light = np.abs(np.fft.fft2(field, (count, count))) ** 2
+    square = np.square(np.fft.fftfreq(count) * IMAGE_DEG * 60.0)
+    is_outside = np.add.outer(square, square) > CORE_ARCMIN**2
+    return float(light[is_outside].sum() / light.sum())
 
 
 # Lenses against myopia
