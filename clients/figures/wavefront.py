@@ -236,7 +236,7 @@ def draw_wavefront_map(
     rms = rms_um(zernike_um, from_order=from_order)
     if rms < LEAST_RMS_UM:
         is_higher = from_order >= LOWEST_HIGHER_ORDER
-        known = "none are known,\nand none are assumed" if is_higher else "flat"
+        known = "no higher orders\nin the coefficients" if is_higher else "flat"
         _draw_no_map(axes, title, known)
         return
     values = wavefront_values_um(zernike_um, from_order=from_order)[:, ::-1]

@@ -111,8 +111,9 @@ def _difference(before: EyeFacts, after: EyeFacts) -> Section:
             *(Row((table,)) for table in tables),
             Row((*(_map(*pair, studies) for pair in pairs), bars)),
             Row(tuple(_psfs(*pair, psf_sides_arcmin(studies)) for pair in pairs)),
-            Row((Text((legend(after.study, after.notation),)),)),
-            *(Row((Text(limits),)) for limits in _limits(before, after)),
+            Row(
+                (Text((legend(after.study, after.notation), *_limits(before, after))),)
+            ),
         ),
     )
 
@@ -171,10 +172,10 @@ def _moments(before: EyeFacts, after: EyeFacts) -> tuple[str, str]:
     return SIDE_NAMES[sides[0]], SIDE_NAMES[sides[1]]
 
 
-def _limits(before: EyeFacts, after: EyeFacts) -> tuple[tuple[str, ...], ...]:
+def _limits(before: EyeFacts, after: EyeFacts) -> tuple[str, ...]:
     """Return the limitations that lenses impose on the report, each once."""
-    of_all = [limits_text(f.study.profile) for f in (before, after)]
-    return tuple(dict.fromkeys(limits for limits in of_all if limits))
+    of_all = [limits_text(facts.study.profile) for facts in (before, after)]
+    return tuple(dict.fromkeys(text for limits in of_all for text in limits))
 
 
 def _psfs(study: EyeStudy, label: str, sides_arcmin: tuple[float, float]) -> Plot:

@@ -309,6 +309,7 @@ def _angle_text(h_deg: float) -> str:
     return f"{h_deg:+.0f}".replace("-", "−") if h_deg else "0"
 
 
+LENS_ROWS = ("chamber_depth_mm", "lens_thickness_mm", "lens_power_dpt")
 BIOMETRY_ROWS = {
     "axial_length_mm": "length, mm",
     "keratometry_dpt": "K, dpt",
@@ -320,12 +321,18 @@ BIOMETRY_ROWS = {
 
 def biometry_table(eyes: Sequence[EyeFacts], moments: Sequence[str]) -> Table:
     """Return lengths and powers of two eyes, and their change."""
-    both = [facts.numbers["eye"]["biometry"] for facts in eyes]
+    names = BIOMETRY_ROWS
+    both = [_known_biometry(facts) for facts in eyes]
     rows = [
-        (moment, *(f"{found[name]:.2f}" for name in BIOMETRY_ROWS))
+        (moment, *(f"{found[name]:.2f}" if name in found else "–" for name in names))
         for moment, found in zip(moments, both, strict=True)
     ]
-    changes = (change_text(both[0][name], both[1][name]) for name in BIOMETRY_ROWS)
+    changes = (
+        change_text(both[0][name], both[1][name])
+        if all(name in found for found in both)
+        else ""
+        for name in names
+    )
     label = ""
     if any(isinstance(facts.study.found, EyeWithImplant) for facts in eyes):
         label = (
@@ -339,6 +346,19 @@ def biometry_table(eyes: Sequence[EyeFacts], moments: Sequence[str]) -> Table:
         note="K of the front of the cornea, index 1.3375; chamber from the front of "
         f"the cornea to the lens or implant; lens power in the eye, at 555 nm.{label}",
     )
+
+
+def _known_biometry(facts: EyeFacts) -> dict[str, float]:
+    """Return lengths and powers without those of a lens that an implant replaced.
+
+    The model of an eye with an implant that acts as a phase has its natural lens.
+    """
+    found: dict[str, float] = facts.numbers["eye"]["biometry"]
+    lens = facts.study.profile.correction
+    is_replaced = isinstance(lens, WornLens) and lens.replaces_lens
+    if not is_replaced or isinstance(facts.study.found, EyeWithImplant):
+        return found
+    return {name: value for name, value in found.items() if name not in LENS_ROWS}
 
 
 def vision_cell(label: str, pupil: dict[str, Any], facts: EyeFacts) -> str:

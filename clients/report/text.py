@@ -101,6 +101,7 @@ REPLACEMENTS = {
         "no vertex distance was given; powers of spectacles usually refer to a lens "
         "12 to 14 mm in front of it"
     ),
+    "; set residual_sphere_dpt to describe the eye before surgery": "",
 }
 OPTION_HINT = '; "higher_order"'
 """Start of the part of a note that names an option of the profile."""

@@ -105,6 +105,21 @@ def test_the_surgery_is_told_with_what_is_known(before, with_implant, with_laser
     assert "laser surgery, residual 0.00 dpt sph" in subtitle(with_laser)
 
 
+def test_two_implants_of_version_0_2_are_told_without_the_natural_lens():
+    bifocal = {"kind": "iol", "design": "bifocal", "add_dpt": 3.0}
+    text = text_of(
+        *(
+            facts_of(MYOPE | {"correction": worn}, label=name, has_charts=False)
+            for name, worn in (("A", OLD_IMPLANT), ("B", bifocal))
+        )
+    )
+    assert text.count("it acts as a phase in the pupil") == 1
+    assert "is the refraction after surgery" in text
+    assert "residual_sphere_dpt" not in text
+    lengths = re.search(r"\('A', '\d\d\.\d\d', '\d\d\.\d\d', '–', '–', '–'\)", text)
+    assert lengths
+
+
 def test_acuity_is_told_in_the_notation_of_choice(before, with_implant):
     shown = with_implant.numbers["pupils"][0]["as_it_is"]["log_mar"]
     text = text_of(with_implant)
@@ -139,7 +154,7 @@ def test_a_map_without_higher_orders_says_so():
         title="orders 3 to 6",
     )
     assert [text.get_text() for text in axes.texts] == [
-        "none are known,\nand none are assumed"
+        "no higher orders\nin the coefficients"
     ]
     assert not axes.images
     assert "RMS" not in axes.get_xlabel()
