@@ -62,7 +62,7 @@ from tests.numerical.left_out_people import (
     told_change_um,
 )
 
-MINUTES = 7
+MINUTES = 3.5
 FOLDS, QUICK_FOLDS = 5, 2
 PEOPLE, QUICK_PEOPLE = 50, 4
 """Drawn persons."""

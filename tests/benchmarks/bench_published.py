@@ -32,7 +32,7 @@ from tests.benchmarks.published_figures import CONDITIONS
 from tests.benchmarks.rows import row_of
 from tests.numerical.scene_frames import scene_view
 
-MINUTES = 5
+MINUTES = 1.5
 PICTURES = ROOT / "tests" / "data" / "published_pipeline.npz"
 SIZE, FOV_DEG = (128, 72), 12.0
 STATE = State(5.0, 0.5)
