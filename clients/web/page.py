@@ -222,10 +222,10 @@ class Page:
                     for label, is_reading in (("Far", False), ("Reading", True)):
                         small_button(label, partial(self._look, is_reading))
                 with ui.element("div").classes("oc-look-group") as group:
-                    group.props('role=group aria-label="Distance of chart or photo"')
-                    ui.label("Distance").props("aria-hidden=true")
+                    group.props('role=group aria-label="Look at a distance"')
+                    ui.label("Look at").props("aria-hidden=true")
                     for label, meters in DISTANCES_M.items():
-                        small_button(label, partial(self._set_distance, meters))
+                        small_button(label, partial(self._look_at, meters))
                 ui.element("span").classes("oc-grow")
                 with more():
                     self._pipelines = toggle(
@@ -404,6 +404,11 @@ class Page:
 
     def _set_distance(self, meters: float) -> None:
         self.state.move(DISTANCE.name, round(1.0 / meters, 4))
+        self._show_values()
+        self.request()
+
+    def _look_at(self, meters: float) -> None:
+        self.state.look_at_distance(meters)
         self._show_values()
         self.request()
 

@@ -55,6 +55,9 @@ READING_DPT = 2.5
 READING_GAZE_DEG = -30.0
 """Vertical gaze for reading without a progressive lens."""
 
+WHOLE_SCENES = ("night_road",)
+"""Scenes of scenarios that A and B show whole: what matters is at one side."""
+
 SCENES = ("courtyard", "primitives", "night_road", "stairs", "chart")
 """Scenes that need no file; a new page shows the first one."""
 
@@ -302,6 +305,14 @@ class PageState:
         }
         self.is_focus_set = False
 
+    def look_at_distance(self, meters: float) -> None:
+        """Look at a distance, and move a flat picture there; a scene stays in place."""
+        distance_dpt = round(1.0 / meters, 4)
+        if self.is_flat:
+            self.move(DISTANCE.name, distance_dpt)
+        else:
+            self.values[FOCUS.name] = distance_dpt
+
     def start_scenario(self, scenario: Scenario) -> None:
         """Set the entries to those of a scenario."""
         notation = self.notation
@@ -322,6 +333,7 @@ class PageState:
         for name, one in ((side, scenario.a), (B_OF[side], scenario.b)):
             self.load_body(name, one.profile, one.title)
         self.wants_comparison = True
+        self.arrangement = "beside" if scenario.scene in WHOLE_SCENES else "divider"
 
     def load_body(self, eye: EyeName, body: Mapping[str, Any], name: str) -> None:
         """Load a profile into an eye, with the age of the person."""

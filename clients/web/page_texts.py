@@ -19,8 +19,8 @@ CONDITIONS_HELP = (
     "higher through a pupil of 3 mm than through a wide one: uncorrected, 2.50 dpt of "
     "myopia read 0.20 through 3.3 mm, where people read 0.17 to 0.19. The focus is the "
     "distance that the eye looks at; “Distance” is that of the letter chart or of a "
-    "photograph without depth. The pencil beside a slider takes a typed value, such as "
-    "6 m, 40 cm, 20 ft or 2.5 dpt."
+    "photograph without depth, which the buttons of “Look at” move, too. The pencil "
+    "beside a slider takes a typed value, such as 6 m, 40 cm, 20 ft or 2.5 dpt."
 )
 HAZE_OFFER = (
     "At night, light that scatters in the eye lies as a veil around lamps; these "

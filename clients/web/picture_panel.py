@@ -133,7 +133,6 @@ class ScenePanel:
                 self._set_notation,
                 label="Acuity as",
             ).classes("oc-notation")
-            self._notation.set_visibility(False)
 
     def build_uploads(self) -> None:
         """Build the uploads of a photo or a 3D file, which the scene may need."""
@@ -217,7 +216,6 @@ class ScenePanel:
     async def _choose(self, event: events.ValueChangeEventArguments) -> None:
         self.kind = event.value
         self._problem.text = ""
-        self._notation.set_visibility(self.kind == "chart")
         self._uploads.refresh()
         await self._show()
 

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from clients.acuity_text import Notation, acuity_text
 from clients.figures import EyeStudy, acuity_log_mar
+from estimator import parse_profile
 
 SHARP_LOG_MAR = 0.1
 """Acuity 0.8 (20/25), where the range of normal vision ends (International Council of
@@ -43,6 +44,13 @@ FOCUS_CODES = (
 """Codes of the notes of `estimator` that this sentence replaces."""
 
 IMPLANT_FOCUS = "The implant cannot change its focus."
+LACKING_STEP_DPT = 0.25
+LACKING = "The eye cannot focus {}; spectacles would need {} dpt more."
+HAZY_RATIO = 0.35
+"""Scattered light from which an eye is called hazy: a healthy eye of 80 scatters 0.34,
+a posterior subcapsular cataract 0.39."""
+
+AFTER_SURGERY = "refraction_after_surgery"
 WITHOUT_HAZE = "straylight is not included"
 LENSLETS = "The acuity through lenslets is not predicted."
 
@@ -122,7 +130,7 @@ def eye_sentences(
         sentence, others = LENSLETS, [*notes]
     elif sight is not None:
         worn = profile.get("correction") or {}
-        reasons = [*map(_reason, of_focus)]
+        reasons = [_reason(note, object_dpt) for note in of_focus]
         if reasons and worn.get("kind") == "iol":
             reasons = [IMPLANT_FOCUS]
         sentence = _sight_sentence(
@@ -130,18 +138,36 @@ def eye_sentences(
             reasons,
             object_dpt=object_dpt,
             notation=notation,
-            has_haze="straylight" in profile,
+            scattered_ratio=_scattered_ratio(profile),
         )
     return " ".join(filter(None, [sentence, *map(_sentence, others)]))
 
 
 def _sentence(note: str) -> str:
     text = note.removeprefix("blurred: ").rstrip(".")
+    if getattr(note, "code", "") == AFTER_SURGERY:
+        text = text.partition(";")[0]  # the rest is for programs
     return f"{text[:1].upper()}{text[1:]}."
 
 
-def _reason(note: str) -> str:
+def _scattered_ratio(profile: Mapping[str, Any]) -> float | None:
+    """Return how much of the light an eye scatters; None if this is left out."""
+    if "straylight" not in profile:
+        return None
+    haze = parse_profile(dict(profile)).straylight
+    return None if haze is None else haze.fraction
+
+
+def _reason(note: str, object_dpt: float) -> str:
     """Return the part of a note on the focus that is for the patient."""
+    values = getattr(note, "values", {})
+    if getattr(note, "code", "") == "focus_out_of_reach" and values:
+        lacking_dpt = values["focus_dpt"] - values["near_point_dpt"]
+        lacking_dpt = LACKING_STEP_DPT * round(lacking_dpt / LACKING_STEP_DPT)
+        if lacking_dpt >= LACKING_STEP_DPT:
+            where = _distance(object_dpt)
+            where = where if where == FAR else f"on {where}"
+            return LACKING.format(where, f"{lacking_dpt:+.2f}")
     text = _sentence(note).partition(";")[0].rstrip(".")
     text = text.replace(", as is every distance", "")  # it may still read there
     return text.replace(" is sharp", " is exactly in focus") + "."
@@ -153,7 +179,7 @@ def _sight_sentence(
     *,
     object_dpt: float,
     notation: Notation,
-    has_haze: bool,
+    scattered_ratio: float | None,
 ) -> str:
     """Return a sentence on the acuity, with reasons for blur."""
     log_mar = sight["log_mar"]
@@ -161,7 +187,9 @@ def _sight_sentence(
     if math.isfinite(log_mar):
         predicted = f"predicted acuity {_acuity(log_mar, notation)}"
     word = next((each for limit, each in WORDS if log_mar <= limit), "Blurred")
-    haze = f" ({WITHOUT_HAZE})" if has_haze else ""
+    haze = "" if scattered_ratio is None else f" ({WITHOUT_HAZE})"
+    if scattered_ratio is not None and scattered_ratio >= HAZY_RATIO:
+        word = f"Hazy, otherwise {word.lower()}"
     where = _distance(object_dpt)
     where = where if where == FAR else f"at {where}"
     parts = [f"{word} {where}: {predicted}{haze}."]

@@ -79,10 +79,22 @@ def test_nothing_is_said_of_the_focus_until_the_acuity_is_known():
         "The acuity through lenslets is not predicted. The eye lacks 2 dpt for 40 cm."
     )
     blurred = {"log_mar": math.inf, "readable_dpt": None}
-    shown = eye_sentences(blurred, [], {"straylight": {}}, **state)
+    aged = {"kind": "preset", "name": "emmetropia", "straylight": {}}
+    shown = eye_sentences(blurred, [], aged, **state)
     assert shown == (
         "Blurred at 40 cm: predicted acuity worse than 0.05 (straylight is not "
         "included)."
+    )
+    hazy = {"kind": "preset", "name": "emmetropia", "straylight": {"log_s": 1.6}}
+    shown = eye_sentences({"log_mar": 0.14, "readable_dpt": None}, [], hazy, **state)
+    assert shown.startswith("Hazy, otherwise almost sharp at 40 cm: predicted acuity")
+    clear = hazy | {"straylight": {"log_s": 1.2}}
+    shown = eye_sentences({"log_mar": 0.14, "readable_dpt": None}, [], clear, **state)
+    assert shown.startswith("Almost sharp at 40 cm")
+    lacking = Note(note.code, note, focus_dpt=2.5, near_point_dpt=-0.12)
+    shown = eye_sentences(blurred, [lacking], {}, **state)
+    assert shown.endswith(
+        "The eye cannot focus on 40 cm; spectacles would need +2.50 dpt more."
     )
     for log_mar, word in ((0.1, "Sharp"), (0.14, "Almost sharp"), (0.21, "Slightly")):
         shown = eye_sentences(

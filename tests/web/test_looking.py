@@ -39,6 +39,14 @@ def test_reading_goes_through_the_addition_and_far_back(page):
     _caption(page, r"logMAR (−0\.1|0\.[0-2])")
 
 
+def test_the_eye_looks_at_a_distance_in_a_scene(page):
+    number = page.number()
+    page.choose("40 cm")
+    assert page.settle(after=number)["wanted_focus_dpt"] == 2.5
+    assert page.slider("distance_dpt").is_disabled()
+    page.page.locator(".oc-sight").get_by_text("at 40 cm").wait_for()
+
+
 def test_the_gaze_reaches_from_45_deg_down_to_30_deg_up(page):
     slider = page.slider("gaze_v_deg")
     assert (slider.get_attribute("min"), slider.get_attribute("max")) == ("-45", "30")
