@@ -73,8 +73,9 @@ ARCMIN_PER_MRAD = 60.0 * math.degrees(1e-3)
 SLOPE_COUNT = 81
 """Number of points across a pupil at which ray directions are computed."""
 
-DECADES = 2.0
-"""Decades of light from white to black."""
+DECADES = 3.0
+"""Decades of light from white to black: the halo of a trifocal lens is 1/600 as bright
+as the image of a point."""
 
 NICE_ARCMIN = (1, 2, 5, 10, 20, 30, 60, 120, 300, 600)
 
@@ -369,7 +370,7 @@ def psf_picture(
 def draw_psf(
     axes: Axes, wavefront: PupilWavefront, *, side_arcmin: float, title: str = ""
 ) -> None:
-    """Draw one PSF over two decades of light, with a scale bar."""
+    """Draw one PSF over three decades of light, with a scale bar."""
     kernel = psf_picture(wavefront, side_arcmin=side_arcmin)
     light = np.log10(np.maximum(kernel / kernel.max(), 10.0**-DECADES))
     half = side_arcmin / 2.0

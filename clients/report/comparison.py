@@ -5,6 +5,7 @@ The two are different eyes, times or corrections.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from typing import Any, cast
 
@@ -29,7 +30,6 @@ from clients.figures.wavefront import (
 from clients.report.content import (
     KNOWN_TITLE,
     NOT_A_DEVICE,
-    PSF_MM,
     chart_row,
     field_row,
     legend,
@@ -70,6 +70,7 @@ from clients.report.text import (
 )
 
 PAIR_MAP_MM, PAIR_CURVES_MM, PAIR_FIELD_MM, PAIR_SECTION_MM = 46.0, 49.0, 64.0, 50.0
+PAIR_PSF_MM = 60.0
 """Heights in the report of two eyes."""
 
 
@@ -185,7 +186,7 @@ def _psfs(study: EyeStudy, label: str, sides_arcmin: tuple[float, float]) -> Plo
         draw_psfs(panel, study, sides_arcmin=sides_arcmin)
         panel.suptitle(label, fontsize=TITLE_PT, **LITERAL)
 
-    return Plot(draw, PSF_MM, f"Point-spread functions: {label}")
+    return Plot(draw, PAIR_PSF_MM, f"Point-spread functions: {label}")
 
 
 def _map(study: EyeStudy, label: str, studies: tuple[EyeStudy, ...]) -> Plot:
@@ -295,9 +296,12 @@ def _vision_table(before: EyeFacts, after: EyeFacts) -> Table:
 
 
 def _short_labels(*both: EyeFacts) -> tuple[str, ...]:
-    """Return labels without what is in parentheses, unless they are then the same."""
+    """Return labels without what explains them, unless they are then the same.
+
+    That is what is in parentheses, or follows a letter and a colon: "A: monofocal".
+    """
     labels = tuple(facts.label for facts in both)
-    short = tuple(label.partition(" (")[0] for label in labels)
+    short = tuple(re.split(r" \(|(?<=^\w): ", label)[0] for label in labels)
     return short if all(short) and len({*short}) == len(short) else labels
 
 

@@ -180,7 +180,7 @@ def legend(study: EyeStudy, notation: Notation = "decimal") -> str:
     return (
         "Wavefront at the cornea, without a correction, as the examiner faces the eye "
         "(T temporal, N nasal). Point images and charts as the person sees them; light "
-        "on a logarithmic scale of two decades. “As it is”: focused far, "
+        "on a logarithmic scale of three decades. “As it is”: focused far, "
         "accommodating where that helps"
         + (", through the worn correction" if study.profile.correction else "")
         + ". “Best corrected”: with the sphere and cylinder of the highest visual "

@@ -218,11 +218,12 @@ def test_maps_of_two_eyes_have_the_same_colors(before, with_implant):
     assert limits[0] == limits[1]
 
 
-def test_states_with_letters_keep_them(before, with_implant):
-    labels = "A (spectacles)", "B (trifocal implant)"
+@pytest.mark.parametrize("form", ["{} ({})", "{}: {}"])
+def test_states_with_letters_keep_them(before, with_implant, form):
+    labels = form.format("A", "spectacles"), form.format("B", "trifocal implant")
     states = zip((before, with_implant), labels, strict=True)
     text = repr(comparison_document(*(replace(f, label=one) for f, one in states)))
-    assert "B (trifocal implant): Entered before surgery" in text
+    assert f"{labels[1]}: Entered before surgery" in text
     assert "'A', 'B'" in text
     assert "'before', 'after'" not in text
     assert "'before', 'after'" in repr(comparison_document(before, with_implant))

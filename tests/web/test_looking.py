@@ -89,7 +89,7 @@ def test_the_focus_of_a_click_has_two_decimals(page):
         box["x"] + 0.35 * box["width"], box["y"] + 0.84 * box["height"]
     )
     page.settle(after=number)
-    note = page.page.locator(".oc-note").filter(has_text="The eye lacks")
+    note = page.page.locator(".oc-note").filter(has_text="The eye cannot focus on")
     note.first.wait_for()
     text = note.first.inner_text()
     focus = page.slider("focus_dpt")
