@@ -52,6 +52,7 @@ MAY_IMPORT = {
         "estimator.parse_profile",  # and whether it is one
         "estimator.thread_count",
         "estimator.dynamics",  # of an eye that looks
+        "estimator.media",  # how much light an eye scatters
         "estimator.acuity.letters",  # shapes of letters on charts
         *FACE,
         *EYE_FACE,
