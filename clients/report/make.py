@@ -8,6 +8,8 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
+from PIL import ImageFile
+
 from clients.acuity_text import Notation
 from clients.figures.study import PUPILS_MM, Profile, ProgressCallback, profile_of
 from clients.report.comparison import comparison_document
@@ -240,6 +242,7 @@ def check_pdf() -> Any:
     ReportError
         If PDF output is unavailable (missing dependency).
     """
+    accepts_truncated = ImageFile.LOAD_TRUNCATED_IMAGES
     try:
         from weasyprint import HTML
     except ImportError:
@@ -252,6 +255,8 @@ def check_pdf() -> Any:
             f"PDF output requires the system library Pango ({error}): `apt-get install "
             f"{' '.join(PANGO_PACKAGES)}`. HTML reports need no extra packages."
         ) from None
+    finally:  # WeasyPrint has all images of the process accepted that end early
+        ImageFile.LOAD_TRUNCATED_IMAGES = accepts_truncated
     return HTML
 
 

@@ -14,6 +14,7 @@ from importlib.metadata import version
 
 import numpy as np
 import pytest
+from PIL import Image
 from pypdf import PdfReader
 
 from clients.figures import (
@@ -489,6 +490,16 @@ def test_a_report_says_what_when_and_of_which_profile_it_is(
 
 
 @pytest.mark.clients
+def test_an_image_that_ends_early_is_refused_after_a_pdf(pdf):
+    whole = io.BytesIO()
+    noise = np.random.default_rng(1).integers(0, 256, (9, 9, 3), dtype=np.uint8)
+    Image.fromarray(noise).save(whole, "png")
+    with Image.open(io.BytesIO(whole.getvalue()[:100])) as image:
+        assert pdf.pages
+        with pytest.raises(OSError, match="truncated"):
+            image.load()
+
+
 def test_every_page_says_whose_report_it_is(pdf):
     pages = [page.extract_text() for page in pdf.pages]
     for k, text in enumerate(pages):
