@@ -37,7 +37,7 @@ from tests.benchmarks.rows import row_of
 from tests.benchmarks.service_stream import PROFILE, Stream, processor_s
 from tests.mutated_messages import view_of
 
-MINUTES = 6
+MINUTES = 5
 COMMAND = (sys.executable, "-m", "tests.end_to_end.double_service", "--filter-ms", "5")
 ATTACK = (sys.executable, "-m", "tests.attacks")
 OTHER_ATTACKS = [

@@ -40,7 +40,7 @@ from tests.benchmarks.rows import row_of
 from tests.numerical.scene_frames import scene_view
 from tests.reference.display_pictures import measured_displays
 
-MINUTES = 4
+MINUTES = 1.5
 SIZE_PX, QUICK_SIZE_PX = (480, 270), (96, 54)
 COUNT, QUICK_COUNT = 7, 2
 EYES = ("emmetropia", "myopia", "keratoconus")

@@ -50,7 +50,7 @@ EYES = {
     "post-LASIK": {"kind": "preset", "name": "post_lasik"},
     "60 years": prescription(0.0, age_years=60),
 }
-MINUTES = 3
+MINUTES = 3.5
 PUPILS_MM = 3.0, 5.0
 IN_COURTYARD = (("-2 dpt", 3.0), ("keratoconus", 5.0))
 COURTYARD_FOV_DEG, COURTYARD_MM, SKY_MM = 50.0, 1000.0, 65535

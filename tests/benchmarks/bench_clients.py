@@ -26,7 +26,7 @@ from clients.service_process import ServiceProcess
 from tests.benchmarks.harness import Row, Run
 from tests.benchmarks.service_stream import Stream, processor_s
 
-MINUTES = 4
+MINUTES = 3
 SIZE_PX = (640, 360)
 WARM_UP_S, MEASURED_S = 1.0, 4.0
 N_RUNS = 2

@@ -34,7 +34,7 @@ from tests.numerical.scene_frames import scene_view
 from tests.numerical.synthetic import tangents
 from tests.reference.edge_light import lamp_light, ring_ratios
 
-MINUTES = 4
+MINUTES = 3
 ENGINES = {"native": NativeRenderer, "gl": lambda: FilterRenderer(Gpu())}
 GL_SCENES, GL_FRAMES = ("three lamps",), 4
 LAMP, RADIUS_PX, PITCH_MRAD = 1000.0, 100, 0.7

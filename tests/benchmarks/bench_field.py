@@ -47,7 +47,7 @@ from tests.benchmarks.published_figures import CONDITIONS
 from tests.benchmarks.rows import row_of
 from tests.numerical.scene_frames import SCENES, scene_view
 
-MINUTES = 18
+MINUTES = 29
 FIXED = State(5.0, 0.5)
 SEED = 5
 REPEATS = 3

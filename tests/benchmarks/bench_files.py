@@ -33,7 +33,7 @@ from tests.file_mutants import Kind, kinds, mutant
 
 N_READS, N_COMMANDS = 20_000, 100
 QUICK_READS, QUICK_COMMANDS = 60, 2
-MINUTES = 5
+MINUTES = 2
 N_PROCESSES = 2
 COMMAND_S = 60.0
 MAX_READ_S, MAX_MEMORY_MB = 5.0, 1000.0

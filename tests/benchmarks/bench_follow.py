@@ -32,7 +32,7 @@ from tests.benchmarks.published_figures import CONDITIONS
 from tests.benchmarks.rows import row_of
 from tests.benchmarks.stream_walks import Moment, demo_walk, photograph_walk
 
-MINUTES = 6
+MINUTES = 8
 EYES = CONDITIONS
 STREAM_S = 6.0
 SIZES = (((480, 270), 30.0, EYES), ((1280, 720), 8.0, ("emmetropia", "keratoconus")))

@@ -40,7 +40,7 @@ from tests.reference.flat_image import (
     wavefront_of_profile,
 )
 
-MINUTES = 3
+MINUTES = 4
 WIDTH, HEIGHT = 48, 32
 CAMERA = Camera.from_fov(1.2, width_px=WIDTH, height_px=HEIGHT)
 SETTINGS = FilterSettings(mode="on-axis", eye_model="wavefront", chromatic=False)

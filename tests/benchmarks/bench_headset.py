@@ -43,7 +43,7 @@ from filter_service.errors import FilterError
 from tests.benchmarks.harness import KeptRows, Row, Run
 from tests.benchmarks.rows import row_of
 
-MINUTES = 4
+MINUTES = 11
 SIZES_PX = ((448, 504), (896, 1007))
 QUICK_SIZES_PX = ((112, 126),)
 N_FRAMES, QUICK_FRAMES = 48, 5

@@ -36,7 +36,7 @@ from filter_service.keys import KeyRing
 from tests.benchmarks.harness import Row, Run
 from tests.benchmarks.rows import row_of
 
-MINUTES = 5
+MINUTES = 8
 TRANSPORTS = ("tcp", "ipc", "shm", "curve")
 PROFILE = {"kind": "prescription", "eye_side": "OS", "sphere_dpt": -2}
 STATIC = {"pupil_range_mm": (4.0, 4.0), "focus_range_dpt": (0.0, 0.0)}
